@@ -266,6 +266,11 @@ class SplatModel(abc.ABC):
         """Return what the splats have learned themselves, but no indirect light."""
         return parameters
 
+    def with_albedo(self, parameters: Any, albedo: Float[Array, " 3"]) -> Any:
+        """Return what the splats have learned themselves, with one albedo for all of them."""
+        del albedo
+        return parameters
+
     def settle(self, splats: Splats, surface: Surface, attributes: Attributes) -> Splats:
         """Move the splats by their attributes, such as the inward shift; by default not at all."""
         del surface, attributes

@@ -190,6 +190,13 @@ class FreeSplats(SplatModel):
         """See `SplatModel.without_indirect`."""
         return replace(parameters, indirect=None)
 
+    def with_albedo(
+        self, parameters: FreeSplatParameters, albedo: Float[Array, " 3"]
+    ) -> FreeSplatParameters:
+        """See `SplatModel.with_albedo`."""
+        own = parameters.albedo
+        return replace(parameters, albedo=jnp.broadcast_to(albedo.astype(own.dtype), own.shape))
+
 
 @settings
 class FreeSplatSettings(SplatSettings, kind="free"):

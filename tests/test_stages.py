@@ -13,6 +13,7 @@ from support import MONTE_CARLO, TWO_STAGES, ball, sphere_dataset, tiny_config
 from geosplat_jax.fit import loop as loop_module
 from geosplat_jax.fit.begin import Resume, TakeOver
 from geosplat_jax.fit.config import Rate, Stage
+from geosplat_jax.fit.entering import FreshAlbedo
 from geosplat_jax.fit.folder import RunError, RunFolder
 from geosplat_jax.fit.presets import PRESETS, QUALITIES, make_config
 from geosplat_jax.fit.stages import begin_stage, build_pipeline, require_rates
@@ -135,9 +136,12 @@ def test_a_head_of_indirect_light_is_kept_where_it_means_the_same(after, is_kept
     assert not begun_params.material.albedo_head[-1].weights.any()
 
 
-@pytest.mark.parametrize("after", ["harmonics", "constant"])
-def test_free_splats_forget_indirect_light_that_means_something_else(after):
-    """A second stage of free splats takes over what the first one has learned, if it can."""
+def _refined_twice(change, **learned):
+    """Splats at the start of a second stage of free splats, with harmonics in the first one.
+
+    The second stage is the first one with the changes that `change` gives; `learned` are values
+    that the splats of the first one end with.
+    """
     config = tiny_config(
         "geometry.resolution=6",
         "stages.monte_carlo.steps=1",
@@ -146,18 +150,33 @@ def test_free_splats_forget_indirect_light_that_means_something_else(after):
         "stages.refine.transport.indirect=harmonics",
     )
     refine = config.stage("refine")
-    again = replace(refine, name="again", transport=replace(refine.transport, indirect=after))
+    again = replace(refine, name="again", **change(refine))
     config = replace(config, stages=(*config.stages, again))
     pipeline, params = ball(config, stage="monte_carlo")
     refined = begin_stage(params, pipeline, config, refine)
-    learned = jnp.full_like(refined.splats.indirect, 7.0)
-    refined = replace(refined, splats=replace(refined.splats, indirect=learned))
+    values = {name: jnp.full_like(getattr(refined.splats, name), x) for name, x in learned.items()}
+    refined = replace(refined, splats=replace(refined.splats, **values))
     refined_pipeline = replace(
         build_pipeline(config, refine, pipeline.surface), capacities=pipeline.capacities
     )
-    begun = begin_stage(refined, refined_pipeline, config, again)
-    assert begun.splats.indirect.shape[1] == (27 if after == "harmonics" else 6)
-    assert bool((begun.splats.indirect == 7.0).all()) is (after == "harmonics")
+    return begin_stage(refined, refined_pipeline, config, again).splats
+
+
+@pytest.mark.parametrize("after", ["harmonics", "constant"])
+def test_free_splats_forget_indirect_light_that_means_something_else(after):
+    """A second stage of free splats takes over what the first one has learned, if it can."""
+    splats = _refined_twice(
+        lambda refine: {"transport": replace(refine.transport, indirect=after)}, indirect=7.0
+    )
+    assert splats.indirect.shape[1] == (27 if after == "harmonics" else 6)
+    assert bool((splats.indirect == 7.0).all()) is (after == "harmonics")
+
+
+@pytest.mark.parametrize("is_fresh", [True, False])
+def test_a_fresh_albedo_is_that_of_free_splats_as_well(is_fresh):
+    entries = (FreshAlbedo("grey"),) if is_fresh else ()
+    splats = _refined_twice(lambda _: {"enter": entries}, albedo=0.25)
+    np.testing.assert_allclose(splats.albedo, 0.5 if is_fresh else 0.25, rtol=1e-6)
 
 
 @pytest.mark.parametrize("quality", QUALITIES)

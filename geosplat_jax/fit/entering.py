@@ -91,7 +91,8 @@ class Entry(Variant, abc.ABC):
 class FreshAlbedo(Entry, kind="fresh_albedo"):
     """Start with a new albedo field of one colour, so that no shadow is left in it.
 
-    Where the encoding of albedo feeds heads that stay, only the albedo's head is drawn anew.
+    Where the encoding of albedo feeds heads that stay, only the albedo's head is drawn anew. Free
+    splats, whose albedo is their own, get the same colour.
     """
 
     colour: Literal["mean", "grey"] = "mean"
@@ -103,12 +104,17 @@ class FreshAlbedo(Entry, kind="fresh_albedo"):
         colour = jnp.full((3,), _GREY)
         if self.colour == "mean":
             colour = mean_albedo(params, pipeline)
+        colour = jnp.clip(colour, _DARKEST, 1.0 - _DARKEST)
         field = params.material
         new_field = init_materials(key, pipeline.fields)
         is_needed = pipeline.fields.shared or field.indirect_head is not None
         table = field.albedo_table if is_needed else new_field.albedo_table
         head = _one_colour(new_field.albedo_head, colour)
-        return replace(params, material=replace(field, albedo_table=table, albedo_head=head))
+        return replace(
+            params,
+            material=replace(field, albedo_table=table, albedo_head=head),
+            splats=pipeline.splats.with_albedo(params.splats, colour),
+        )
 
 
 @jax.jit
@@ -127,7 +133,7 @@ def mean_albedo(params: Params, pipeline: Pipeline) -> Float[Array, " 3"]:
 def _one_colour(head: tuple[Layer, ...], albedo: Float[Array, " 3"]) -> tuple[Layer, ...]:
     """Return the albedo head with a last layer that gives one colour everywhere."""
     *hidden_layers, last_layer = head
-    albedo = jnp.clip(albedo.astype(last_layer.weights.dtype), _DARKEST, 1.0 - _DARKEST)
+    albedo = albedo.astype(last_layer.weights.dtype)
     logits = jnp.log(albedo) - jnp.log1p(-albedo)
     return (*hidden_layers, Layer(jnp.zeros_like(last_layer.weights), logits))
 
