@@ -19,6 +19,7 @@ from geosplat_jax.fit.config import Config
 from geosplat_jax.fit.folder import RunError, RunFolder, folder_beside
 from geosplat_jax.fit.listener import NOBODY, Listener
 from geosplat_jax.fit.presets import REFINE, SPLIT_SUM, make_config
+from geosplat_jax.fit.surfaces import SurfaceSettings
 from geosplat_jax.io.dataset import Dataset, load_recorded
 from geosplat_jax.io.documents import parse_json
 from geosplat_jax.io.images import written_aside
@@ -93,6 +94,7 @@ def refined_cameras(
     config: Config | None = None,
     reading: Mapping[str, Any] | None = None,
     how: CameraSettings | None = None,
+    geometry: SurfaceSettings | None = None,
     replace: bool = False,
     listener: Listener = NOBODY,
     on_view: Callable[[str, ViewProgress], None] | None = None,
@@ -110,6 +112,8 @@ def refined_cameras(
     config : settings of a round's training; `round_config` by default.
     reading : how to read the scene, see `load_recorded`; ``cameras`` are those of the first round.
     how : settings of the refinement; by default those of `CameraSettings`.
+    geometry : surface of the run to come, to refuse a start mesh that does not fit the scene before
+        anything is removed or trained.
     replace : remove a run that ``output`` holds before the first round.
     listener : receives the events of the trainings.
     on_view : called after every refined view, with the name of its split and the progress.
@@ -117,7 +121,7 @@ def refined_cameras(
     Raises
     ------
     ValueError
-        If ``rounds`` is less than 1.
+        If ``rounds`` is less than 1, or ``geometry`` does not fit the scene.
     RunError
         If there are rounds that were made with other settings; and see `train`.
     SceneError, TrainingError, Interrupted
@@ -130,6 +134,8 @@ def refined_cameras(
     cameras, how = Path(), how or CameraSettings()
     dataset: Dataset | None = load_recorded(scene, options)
     assert dataset is not None
+    if geometry is not None:
+        geometry.notes(dataset)
     provenance = {
         "scene": str(Path(scene).resolve()),
         "reading": options,

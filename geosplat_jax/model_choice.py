@@ -142,7 +142,8 @@ def choose_model(
     Raises
     ------
     ValueError
-        If there are too few views to hold any back, or nothing is trained.
+        If there are too few views to hold any back, nothing is trained, or the surface cannot start
+        in the scene.
     RunError
         If there is a choice already that is neither to be resumed nor replaced, that was begun with
         other settings or photographs, or that another process is making.
@@ -157,6 +158,7 @@ def choose_model(
     with locked_folder(trials.state_path.parent, own=trials.state_path):
         trials.open(begin)
         if begin.replace:
+            config.geometry.notes(dataset)  # Refuses a start mesh that does not fit the scene.
             RunFolder(output).make_room(replace=True)
         for part in candidate_parts:
             if not kept_names.issuperset(_among(part.follows, candidate_parts)):

@@ -15,6 +15,7 @@ from geosplat_jax.cli import training
 from geosplat_jax.fit.cameras import CameraSettings
 from geosplat_jax.fit.folder import RunError, RunFolder
 from geosplat_jax.fit.presets import make_config
+from geosplat_jax.fit.surfaces import FlexiCubesSettings
 from geosplat_jax.io.dataset import Dataset, load_dataset
 from geosplat_jax.io.images import SceneError
 from geosplat_jax.run import Run
@@ -150,6 +151,22 @@ def test_a_run_that_is_to_be_replaced_is_gone_before_the_first_round(made, tmp_p
     refined_cameras("scene", old_run.path, replace=True)
     assert not old_run.exists
     assert (old_run.path / "notes.txt").exists()
+
+
+def test_a_surface_that_cannot_start_is_refused_before_anything_is_removed(
+    made, tmp_path, monkeypatch
+):
+    def refuses(self, dataset):
+        raise ValueError("is not where the cameras see the object")
+
+    old_run = RunFolder(tmp_path / "fox")
+    with old_run.locked():
+        old_run.begin(sphere_dataset(), tiny_config(), replace=False)
+    monkeypatch.setattr(FlexiCubesSettings, "notes", refuses)
+    with pytest.raises(ValueError, match="not where the cameras see"):
+        refined_cameras("scene", old_run.path, geometry=FlexiCubesSettings(), replace=True)
+    assert old_run.exists
+    assert not made
 
 
 def test_the_seed_of_a_training_is_that_of_its_rounds():

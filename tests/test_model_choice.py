@@ -4,6 +4,7 @@ import json
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import jax.numpy as jnp
 import numpy as np
@@ -19,6 +20,7 @@ from geosplat_jax.fit.folder import RunError, RunFolder, locked_folder
 from geosplat_jax.fit.listener import Listener
 from geosplat_jax.fit.model_parts import LADDER, without
 from geosplat_jax.fit.presets import make_config
+from geosplat_jax.fit.surfaces import FlexiCubesSettings
 from geosplat_jax.fit.train import Interrupted, TrainingError, load_trained
 from geosplat_jax.io.views import some_views
 from geosplat_jax.model_choice import ModelChoice, choice_folder, choose_model
@@ -247,7 +249,9 @@ def test_a_choice_of_other_photographs_is_not_gone_on_with(dataset, trainings, t
             choose_model(dataset, config, tmp_path / "run", begin=Anew(replace=True))
 
 
-def test_a_run_is_replaced_only_once_the_choice_is_possible(dataset, trainings, tmp_path):
+def test_a_run_is_replaced_only_once_the_choice_is_possible(
+    dataset, trainings, tmp_path, monkeypatch
+):
     run = RunFolder(tmp_path / "run")
     with run.locked():
         run.begin(dataset, tiny_config(), replace=False)
@@ -260,6 +264,12 @@ def test_a_run_is_replaced_only_once_the_choice_is_possible(dataset, trainings, 
             choose_model(scene, make_config(quality="draft"), run.path, begin=Anew(replace=True))
         assert run.exists
     letter.unlink()
+    refusal = ValueError("not where the cameras see it")
+    with monkeypatch.context() as patch:
+        patch.setattr(FlexiCubesSettings, "notes", Mock(side_effect=refusal))
+        with pytest.raises(ValueError, match="not where the cameras see it"):
+            choose_model(dataset, make_config(quality="draft"), run.path, begin=Anew(replace=True))
+    assert run.exists
     trainings.stops_at = 0
     with pytest.raises(Interrupted):
         choose_model(dataset, make_config(quality="draft"), run.path, begin=Anew(replace=True))

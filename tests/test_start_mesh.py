@@ -1,5 +1,6 @@
 """Meshes to start from: cleaning, refused meshes, and agreement with the cameras."""
 
+import json
 import sys
 from dataclasses import replace
 
@@ -27,6 +28,7 @@ from geosplat_jax.io.start_mesh import (
     sized,
 )
 from geosplat_jax.io.views import Views
+from geosplat_jax.report.consistency import load_mesh
 
 RADIUS = 0.5  # of the ball that the views show
 
@@ -255,11 +257,71 @@ def test_meshes_that_cannot_be_used_are_refused(tmp_path, monkeypatch):
     read_start.cache_clear()
     with pytest.raises(ValueError, match="10000000 faces, more than 5000000; decimate it first"):
         read(path)
-    faces[0, 0] = 99
-    monkeypatch.setattr(start_mesh, "read_mesh", lambda path: (vertices, faces))
-    with pytest.raises(ValueError, match="faces of vertices that it does not have"):
-        read(path)
     read_start.cache_clear()
+
+
+@pytest.mark.parametrize("row", [7, -1])
+def test_faces_of_vertices_that_do_not_exist_are_refused(tmp_path, row):
+    path = tmp_path / "mesh.ply"
+    path.write_text(
+        "ply\nformat ascii 1.0\nelement vertex 4\n"
+        "property float x\nproperty float y\nproperty float z\n"
+        "element face 2\nproperty list uchar int vertex_indices\nend_header\n"
+        f"0 0 0\n1 0 0\n0 1 0\n0 0 1\n3 0 1 2\n3 0 1 {row}\n"
+    )
+    with pytest.raises(ValueError, match="faces of vertices that it does not have"):
+        read(str(path))
+    with pytest.raises(ValueError, match="faces of vertices that it does not have"):
+        load_mesh(path)
+
+
+def test_a_changed_buffer_of_a_gltf_file_is_noticed(tmp_path):
+    files = trimesh.Trimesh(*ball()).export(file_type="gltf")
+    for name, content in files.items():
+        (tmp_path / name).write_bytes(content)
+    (path,) = tmp_path.glob("*.gltf")
+    digest = digest_of(path)
+    assert digest_of(path) == digest
+    buffer = json.loads(path.read_text())["buffers"][-1]
+    buffer_path = tmp_path / buffer["uri"]
+    buffer_path.write_bytes(buffer_path.read_bytes()[::-1])
+    with pytest.raises(ValueError, match="is not the mesh that it was"):
+        read_start(str(path), digest)
+
+
+@pytest.mark.parametrize("corner", ["{0}", "{0}//{0}", "{0}/-1/{0}"])
+def test_negative_indices_count_back_from_their_line(tmp_path, corner):
+    """Two boxes, each with its vertices right before its faces."""
+    box = trimesh.creation.box()
+    lines = ["vt 0 0"]
+    for offset in (0.0, 4.0):
+        lines += [f"v {x + offset} {y} {z}" for x, y, z in box.vertices]
+        lines += [f"vn {x} {y} {z}" for x, y, z in box.vertices]
+        lines += ["f " + " ".join(corner.format(row) for row in face) for face in box.faces - 8]
+    path = tmp_path / "boxes.obj"
+    path.write_text("\n".join(lines))
+    mesh = read(str(path))
+    assert mesh.is_closed
+    assert len(mesh.faces) == 24
+    np.testing.assert_allclose(signed_volume(mesh.vertices, mesh.faces), 2.0)
+    np.testing.assert_allclose(np.ptp(mesh.vertices, axis=0), [5.0, 1.0, 1.0])
+
+
+@pytest.mark.parametrize("turned_face", [3, 12])
+def test_a_closed_mesh_keeps_its_slivers_if_a_face_is_turned(tmp_path, turned_face):
+    """Faces 12 and 13 divide an edge of a box at its middle, where face 12 is a sliver."""
+    box = trimesh.creation.box()
+    first, second, third = box.faces[0]
+    middle = len(box.vertices)
+    vertices = [*box.vertices, box.vertices[[first, second]].mean(axis=0)]
+    faces = np.array(
+        [[first, middle, third], *box.faces[1:], [first, second, middle], [middle, second, third]]
+    )
+    faces[turned_face] = faces[turned_face, ::-1]
+    mesh = read(written(tmp_path, vertices, faces))
+    assert mesh.is_closed
+    assert len(mesh.faces) == 14
+    np.testing.assert_allclose(signed_volume(mesh.vertices, mesh.faces), 1.0)
 
 
 @pytest.mark.parametrize(("factor", "advice"), [(1000, "0.001"), (0.01, "100"), (0.1, "10")])
@@ -286,6 +348,19 @@ def test_pixels_that_do_not_count_say_nothing_against_a_mesh(views):
     images[valid == 0] = 0.0
     agreement = agreement_with_views(points, replace(views, images=images, valid=valid))
     assert agreement > 0.8 * agreement_with_views(points, views)
+
+
+def test_views_that_cut_the_object_off_say_nothing_of_what_they_do_not_show(views):
+    points = RADIUS * trimesh.creation.icosphere(subdivisions=4).vertices
+    rows = slice(13, 19)
+    moved = views.intrinsics - np.array([[0, 0, 0], [0, 0, rows.start], [0, 0, 0]])
+    cut_views = replace(views, images=views.images[:, rows], intrinsics=moved)
+    assert views.mask(0)[rows.start - 3].any()
+    assert agreement_with_views(points, cut_views) > 0.8 * agreement_with_views(points, views)
+    # The width of the object is still seen.
+    for factor in (0.4, 2.5):
+        assert agreement_with_views(factor * points, cut_views) < 0.5
+    assert agreement_with_views(points + np.array([0.0, 0.0, 9.0]), cut_views) == 0.0
 
 
 def test_our_own_obj_and_what_else_says_so_is_turned_from_y_up(tmp_path):

@@ -22,6 +22,7 @@ from geosplat_jax.fit.folder import RunFolder
 from geosplat_jax.fit.listener import NOBODY, Listener, Listeners
 from geosplat_jax.fit.presets import make_config
 from geosplat_jax.fit.start_mesh import MeshSettings
+from geosplat_jax.fit.surfaces import SurfaceSettings
 from geosplat_jax.io.dataset import choose_downscale, load_recorded
 from geosplat_jax.model_choice import ModelChoice
 from geosplat_jax.report.events import EventLog
@@ -201,7 +202,9 @@ def _request_of(arguments: argparse.Namespace, folder: RunFolder) -> _Request:
     return _Request(plan.config, scene_options(arguments, plan.config), budget)
 
 
-def _refined_cameras(arguments: argparse.Namespace, folder: Path, reading: dict[str, Any]) -> Path:
+def _refined_cameras(
+    arguments: argparse.Namespace, folder: Path, reading: dict[str, Any], geometry: SurfaceSettings
+) -> Path:
     """Refine the cameras before the training itself; return and print the file of cameras."""
     draft_config = round_config(arguments.material_prior, seed=arguments.seed)
     say(
@@ -216,6 +219,7 @@ def _refined_cameras(arguments: argparse.Namespace, folder: Path, reading: dict[
             config=draft_config,
             reading=reading,
             how=CameraSettings(white_balance=arguments.white_balance),
+            geometry=geometry,
             replace=arguments.force,
             listener=display,
             on_view=say_refined,
@@ -339,7 +343,7 @@ def train(arguments: argparse.Namespace) -> None:
     if arguments.refine_cameras is not None and not request.goes_on:
         if not arguments.resume:
             run_folder.require_free(replace=arguments.force)
-        reading["cameras"] = _refined_cameras(arguments, folder, reading)
+        reading["cameras"] = _refined_cameras(arguments, folder, reading, config.geometry)
     dataset = load_recorded(arguments.scene, reading)
     if arguments.resume and run_folder.exists:
         notes = run_folder.record().get("notes", dataset.notes)

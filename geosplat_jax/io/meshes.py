@@ -6,10 +6,14 @@ right, ``v`` runs *down*, a texel's centre lies at ``(column + 0.5) / size``.
 """
 
 import json
+import re
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
+from typing import Any
+from urllib.parse import unquote
 
 import numpy as np
 import trimesh
@@ -78,13 +82,13 @@ def read_mesh(
     Raises
     ------
     ValueError
-        If the file cannot be read, holds no triangle, or is an OBJ with faces that are not convex,
-        which would be cut into triangles that overlap.
+        If the file cannot be read, holds no triangle or faces of vertices that do not exist, or is
+        an OBJ with faces that are not convex, which would be cut into triangles that overlap.
     """
     _require_plain(Path(path))
     _require_convex(Path(path))
     try:
-        geometry = trimesh.load(path, process=False)
+        geometry = trimesh.load(**_source(Path(path)), process=False)
     except OSError:
         raise
     except Exception as problem:  # whatever the parser of a format raises
@@ -98,17 +102,57 @@ def read_mesh(
     mesh = geometry.to_mesh() if isinstance(geometry, trimesh.Scene) else geometry
     if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
         raise ValueError(f"{path} must hold a triangle mesh, found no triangle in it")
-    return np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int32)
+    vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int32)
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise ValueError(f"{path} has faces of vertices that it does not have")
+    return vertices, faces
 
 
-def _require_plain(path: Path) -> None:
-    """Refuse glTF whose numbers are packed in a way that is not read, or is read wrongly."""
-    suffix = path.suffix.lower()
-    if suffix not in Y_UP_FORMATS or not path.is_file():
-        return
+def _source(path: Path) -> dict[str, Any]:
+    """Return the arguments that trimesh reads a file by.
+
+    In an OBJ, a negative index counts back from the vertices above its line, but trimesh counts
+    from the end of the file; such indices are replaced by those from the start.
+    """
+    if path.suffix.lower() != ".obj" or not path.is_file():
+        return {"file_obj": path}
+    text = path.read_bytes().replace(b"\\\n", b" ")
+    if not re.search(rb"^f\s.*[\s/]-\d", text, re.MULTILINE):
+        return {"file_obj": path}
+    counts, lines = {b"v": 0, b"vt": 0, b"vn": 0}, []
+    for line in text.splitlines():
+        keyword, *corners = line.partition(b"#")[0].split() or [b""]
+        if keyword in counts:
+            counts[keyword] += 1
+        elif keyword == b"f":
+            line = b" ".join([b"f", *(_from_start(corner, counts) for corner in corners)])
+        lines.append(line)
+    return {"file_obj": BytesIO(b"\n".join(lines)), "file_type": "obj"}
+
+
+def _from_start(corner: bytes, counts: Mapping[bytes, int]) -> bytes:
+    """Turn the negative indices of ``v/vt/vn`` into those that count from the start."""
+    return b"/".join(
+        str(count + 1 + int(index)).encode() if index.startswith(b"-") else index
+        for index, count in zip(corner.split(b"/"), counts.values(), strict=False)
+    )
+
+
+def gltf_buffers(path: Path) -> list[Path]:
+    """Return the files beside a glTF file that hold its numbers; none for other formats."""
+    if path.suffix.lower() != ".gltf":
+        return []
+    buffers = _gltf_tree(path).get("buffers", [])
+    names = [buffer.get("uri", "data:") for buffer in buffers if isinstance(buffer, dict)]
+    paths = [path.parent / unquote(name) for name in names if not name.startswith("data:")]
+    return [path for path in paths if path.is_file()]
+
+
+def _gltf_tree(path: Path) -> dict[str, Any]:
+    """Read the JSON of a glTF file; empty if it cannot be read, which its reader will report."""
     with path.open("rb") as file:
         # A GLB begins with 12 bytes, the length of its JSON, and four letters.
-        if suffix == ".glb":
+        if path.suffix.lower() == ".glb":
             header = file.read(20)
             text = file.read(int.from_bytes(header[12:16], "little")) if len(header) == 20 else b""
         else:
@@ -116,9 +160,15 @@ def _require_plain(path: Path) -> None:
     try:
         tree = json.loads(text)
     except ValueError:
-        return  # The reader of the format says what is wrong.
-    extensions = tree.get("extensionsRequired", []) if isinstance(tree, dict) else []
-    packed = sorted(_PACKED & set(extensions))
+        return {}
+    return tree if isinstance(tree, dict) else {}
+
+
+def _require_plain(path: Path) -> None:
+    """Refuse glTF whose numbers are packed in a way that is not read, or is read wrongly."""
+    if path.suffix.lower() not in Y_UP_FORMATS or not path.is_file():
+        return
+    packed = sorted(_PACKED & set(_gltf_tree(path).get("extensionsRequired", [])))
     if packed:
         raise ValueError(
             f"{path} is compressed ({', '.join(packed)}), which is not read; export it without "

@@ -20,6 +20,7 @@ from geosplat_jax.io.baking import simplified
 from geosplat_jax.io.images import SceneError
 from geosplat_jax.io.meshes import (
     from_y_up,
+    gltf_buffers,
     is_y_up,
     longest_edge,
     nondegenerate,
@@ -97,8 +98,13 @@ def _open_edges(faces: Int[np.ndarray, "F 3"]) -> Int[np.ndarray, " E"]:
     return np.rint(np.bincount(edge_index.reshape(-1), edge_signs)).astype(np.int64)
 
 
+def _has_border(faces: Int[np.ndarray, "F 3"]) -> bool:
+    """Tell whether some edge belongs to an odd number of faces, however they are oriented."""
+    return bool((_open_edges(faces) % 2).any())
+
+
 def digest_of(path: str | Path) -> str:
-    """Return a short digest of the content of a file.
+    """Return a short digest of the content of a mesh file, and of the buffers of a glTF file.
 
     Raises
     ------
@@ -108,8 +114,10 @@ def digest_of(path: str | Path) -> str:
     path = Path(path)
     if not path.is_file():
         raise ValueError(f"there is no mesh file {path}")
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()[:16]
+    digest = hashlib.sha256()
+    for part in (path, *gltf_buffers(path)):
+        digest.update(part.read_bytes())
+    return digest.hexdigest()[:16]
 
 
 @lru_cache(maxsize=1)
@@ -128,8 +136,8 @@ def read_start(path: str, digest: str) -> StartMesh:
     Raises
     ------
     ValueError
-        If the file does not have the digest, or holds no face that can be used, more than
-        `LARGEST`, or faces of vertices that do not exist or are not finite.
+        If `read_mesh` refuses the file, if it does not have the digest, or if it holds no face that
+        can be used, more than `LARGEST`, or faces of vertices that are not finite.
     """
     if digest_of(path) != digest:
         raise ValueError(f"{path} is not the mesh that it was (its digest was {digest})")
@@ -139,8 +147,6 @@ def read_start(path: str, digest: str) -> StartMesh:
             f"{path} has {len(faces)} faces, more than {LARGEST}; decimate it first, to some "
             "hundred thousand"
         )
-    if faces.min() < 0 or faces.max() >= len(vertices):
-        raise ValueError(f"{path} has faces of vertices that it does not have")
     is_used = np.zeros(len(vertices), bool)
     is_used[faces.reshape(-1)] = True
     broken = is_used & ~np.isfinite(vertices).all(axis=1)
@@ -165,7 +171,7 @@ def _cleaned(mesh: StartMesh, path: str) -> StartMesh:
     next_corners = np.roll(faces, -1, axis=1)
     faces = faces[(faces != next_corners).all(axis=1)]
     # Slivers close a surface as other faces do, but add nothing to an open one.
-    if _open_edges(faces).any():
+    if _has_border(faces):
         faces = faces[nondegenerate(vertices, faces)]
     valid_count = len(faces)
     faces = _single(faces)
@@ -220,11 +226,7 @@ def _single(faces: Int[np.ndarray, "F 3"]) -> Int[np.ndarray, "G 3"]:
     )
     unique_faces, is_alone = faces[np.sort(first_rows)], count[group_index.reshape(-1)] == 1
     single_faces = faces[is_alone]
-    if (
-        not _open_edges(unique_faces).any()
-        or not len(single_faces)
-        or _open_edges(single_faces).any()
-    ):
+    if not _has_border(unique_faces) or not len(single_faces) or _has_border(single_faces):
         return unique_faces
     duplicate_faces = faces[np.sort(first_rows[count > 1])]
     return np.concatenate([single_faces, duplicate_faces[~_within(duplicate_faces, single_faces)]])
@@ -306,7 +308,8 @@ def agreement_with_views(points: Float[np.ndarray, "P 3"], views: Views) -> floa
 
     For a view it is the share of the points that lie inside the mask, times the intersection over
     union of the bounding rectangles of points and mask; without masks, the share of the points
-    inside the image. The result is the mean over some views.
+    inside the image. On sides where the image cuts the object off, points beyond the image do not
+    count. The result is the mean over some views.
     """
     view_indices = np.unique(np.linspace(0, len(views) - 1, min(len(views), _VIEWS)).astype(int))
     return float(
@@ -316,34 +319,44 @@ def agreement_with_views(points: Float[np.ndarray, "P 3"], views: Views) -> floa
 
 def _fills(points: np.ndarray, views: Views, view: int, mask: np.ndarray) -> float:
     """See `agreement_with_views`; 0 for a view that sees no point, 1 for an empty mask."""
-    rows, columns = np.nonzero(mask)
-    if not len(rows):
+    if not mask.any():
         return 1.0
+    valid = np.ones_like(mask) if views.valid is None else np.asarray(views.valid[view]) > 0
     pixels, camera_points = project(points, views.world_to_camera[view], views.intrinsics[view])
     pixels = pixels[camera_points[:, 2] > 0]
+    behind_count = len(points) - len(pixels)
+    mask_low, mask_high = _rectangle(mask)
+    if views.has_masks:
+        frame_low, frame_high = _rectangle(valid)
+        is_cut_off = ((pixels < frame_low) & (mask_low <= frame_low)) | (
+            (pixels >= frame_high) & (mask_high >= frame_high)
+        )
+        pixels = pixels[~is_cut_off.any(axis=1)]
     is_inside = in_image(pixels, height=views.height, width=views.width)
     if not is_inside.any():
         return 0.0
     column, row = pixels[is_inside].astype(int).T
-    if views.valid is not None:
-        # Points in pixels that do not count are left out.
-        is_valid = np.ones(len(pixels), bool)
-        is_valid[is_inside] = np.asarray(views.valid[view])[row, column] > 0
-        column, row = column[is_valid[is_inside]], row[is_valid[is_inside]]
-        invalid_count, pixels = len(pixels) - int(is_valid.sum()), pixels[is_valid]
-        if not len(column):
-            return 1.0
-    else:
-        invalid_count = 0
-    share = float(mask[row, column].sum() / (len(points) - invalid_count))
+    # Points in pixels that do not count are left out.
+    is_valid = np.ones(len(pixels), bool)
+    is_valid[is_inside] = valid[row, column]
+    column, row = column[is_valid[is_inside]], row[is_valid[is_inside]]
+    pixels = pixels[is_valid]
+    if not len(column):
+        return 1.0
+    share = float(mask[row, column].sum() / (behind_count + len(pixels)))
     if not views.has_masks:
         return share
     low, high = np.percentile(pixels, (1, 99), axis=0)
-    mask_low = np.array([columns.min(), rows.min()], float)
-    mask_high = np.array([columns.max(), rows.max()], float) + 1
     intersection = np.prod(np.maximum(np.minimum(high, mask_high) - np.maximum(low, mask_low), 0))
     union = np.prod(high - low) + np.prod(mask_high - mask_low) - intersection
     return share * float(intersection / union)
+
+
+def _rectangle(mask: np.ndarray) -> tuple[Float[np.ndarray, " 2"], Float[np.ndarray, " 2"]]:
+    """Return the corners (x, y) of the bounding rectangle of true pixels, in pixels."""
+    rows, columns = np.nonzero(mask)
+    low, high = (columns.min(), rows.min()), (columns.max() + 1, rows.max() + 1)
+    return np.array(low, float), np.array(high, float)
 
 
 def _points_on(mesh: StartMesh) -> Float[np.ndarray, "P 3"]:
