@@ -11,7 +11,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from support import TINY, ball, double_precision, look_at_poses, tiny_config, views_from
+from support import (
+    MONTE_CARLO,
+    TINY,
+    ball,
+    double_precision,
+    look_at_poses,
+    tiny_config,
+    views_from,
+)
 
 from geosplat_jax import cli
 from geosplat_jax.core.capacity import Capacities
@@ -151,6 +159,33 @@ def test_the_white_balance_of_a_render_is_found_again(subject, views):
     np.testing.assert_allclose(parameters[:8], TRUTH, atol=1e-3)
     np.testing.assert_allclose(log_balance(jnp.asarray(parameters)), log_gains, atol=1e-3)
     np.testing.assert_array_equal(log_balance(jnp.asarray(TRUTH)), 0.0)
+
+
+@pytest.mark.parametrize("domain", ["per_splat", "per_pixel"])
+def test_the_light_of_a_subject_has_all_samples(views, domain):
+    """Whatever the run shades, more samples leave less noise under a small sun."""
+    config = tiny_config(
+        *MONTE_CARLO,
+        "geometry.resolution=6",
+        "stages.monte_carlo.transport.occlusion=false",
+        "stages.monte_carlo.transport.indirect=none",
+        f"stages.monte_carlo.domain.kind={domain}",
+    )
+    pipeline, params = ball(config, stage="monte_carlo")
+    radiance = jnp.full((8, 16, 3), 0.2).at[2, 3].set(40.0)
+    params = replace(params, light=EnvLight(radiance))
+    shade = jax.jit(lambda subject, camera: subject.seen_from(camera).pipeline.transport.shaded)
+
+    def noise(samples):
+        first, second = (
+            shade(
+                Renderer(pipeline, params, samples=samples, seed=seed).subject(), views.camera([0])
+            ).diffuse_light
+            for seed in range(2)
+        )
+        return float(jnp.sqrt(jnp.mean(jnp.square(first - second))))
+
+    assert noise(256) < 0.6 * noise(32)
 
 
 def with_capacities(subject, capacities):

@@ -35,6 +35,7 @@ from geosplat_jax.report.renderer import Renderer
 from geosplat_jax.surface.base import Surface, SurfaceModel
 from geosplat_jax.surface.hull import fit_grid
 from geosplat_jax.transport.base import Illumination, Shaded, Transport, TransportSettings
+from geosplat_jax.transport.paths import PathSettings
 
 
 class EveryTriangle(RayIndex):
@@ -241,6 +242,20 @@ def mesh_config():
         weights={**THIRD.weights, "offset": Schedule(0.1)},
     )
     return replace(config, geometry=TrianglesSettings(), stages=(*stages, third_stage))
+
+
+@pytest.mark.parametrize("preset", ["default", "paper"])
+def test_another_kind_keeps_the_settings_that_both_have(preset):
+    path = "stages.monte_carlo.transport"
+    overrides = (f"{path}.specular_count=5", f"{path}.kind=paths", f"{path}.bounce_count=3")
+    old = make_config(preset).stage("monte_carlo").transport
+    new = make_config(preset, overrides=overrides).stage("monte_carlo").transport
+    assert (new.kind, new.bounce_count, new.specular_count) == ("paths", 3, 5)
+    assert new.light_count == old.light_count != PathSettings().light_count
+    assert new.residual_count == old.residual_count
+    # A whole section replaces the old one.
+    whole = make_config(preset, overrides=(f'{path}={{kind="paths"}}',))
+    assert whole.stage("monte_carlo").transport == PathSettings()
 
 
 @pytest.fixture(scope="module")

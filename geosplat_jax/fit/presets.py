@@ -597,14 +597,17 @@ def make_config(
 def _of_kinds(values: dict[str, Any], preset: Config) -> Config:
     """Return the settings of a preset with other kinds of parts.
 
-    Rates and weights of parts that the new kinds do not have are left out. Where the surface of the
-    preset was frozen, that of another kind is frozen as well; elsewhere its rates are to be given.
+    A new kind keeps the values of the old one for those settings that both have. Rates and weights
+    of parts that the new kinds do not have are left out. Where the surface of the preset was
+    frozen, that of another kind is frozen as well; elsewhere its rates are to be given.
     """
-    stages = values["stages"]
     bare_stages = {
-        name: {**stage, "steps": 0, "rates": {}, "weights": {}} for name, stage in stages.items()
+        name: {**stage, "steps": 0, "rates": {}, "weights": {}}
+        for name, stage in values["stages"].items()
     }
     bare_config = config_from_dict({**values, "stages": bare_stages})
+    values = _keeping(preset.to_dict(), bare_config.to_dict(), values)
+    stages = values["stages"]
     weight_names = (*term_names(), *bare_config.geometry.penalty_names)
     surface_groups = preset.geometry.rate_groups
     new_groups = set(bare_config.geometry.rate_groups) - set(surface_groups)
@@ -616,6 +619,18 @@ def _of_kinds(values: dict[str, Any], preset: Config) -> Config:
         weights = {name: x for name, x in stage["weights"].items() if name in weight_names}
         fitting_stages[name] = {**stage, "rates": rates | new_rates, "weights": weights}
     return config_from_dict({**values, "stages": fitting_stages})
+
+
+def _keeping(old: Any, new: Any, given: Any) -> Any:
+    """Return given settings; those of another kind with the settings that the old kind has, too.
+
+    ``new`` : all settings that the kinds of ``given`` have.
+    """
+    if not all(isinstance(values, dict) for values in (old, new, given)):
+        return given
+    if old.get("kind") == given.get("kind", old.get("kind")):
+        return {name: _keeping(old.get(name), new.get(name), x) for name, x in given.items()}
+    return {name: x for name, x in old.items() if name in new} | given
 
 
 def _finished(

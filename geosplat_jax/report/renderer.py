@@ -23,7 +23,7 @@ from geosplat_jax.fit.cameras import Subject
 from geosplat_jax.fit.train import Trained
 from geosplat_jax.io.images import encode_srgb, straight
 from geosplat_jax.pipeline import Pipeline
-from geosplat_jax.render import Asset, Params, RenderOutput, RenderPipeline
+from geosplat_jax.render import Asset, Params, PerSplat, RenderOutput, RenderPipeline
 from geosplat_jax.surface.base import Surface
 from geosplat_jax.transport.base import Illumination
 from geosplat_jax.transport.environment import LightSpec
@@ -289,11 +289,16 @@ class Renderer:
         """Return the scene that cameras are refined against: this asset under this light.
 
         Diffuse light is the mean over all passes; the specular lobe has the samples of the first.
+        Splats are shaded, even where the run shades pixels.
         """
-        illumination = self._illuminated()[0]
+        asset, renderer = self.asset(), self._copy()
+        if not isinstance(self._pipeline.domain, PerSplat):
+            renderer._pipeline = replace(self._pipeline, domain=PerSplat())
+            renderer._illuminations = []
+        illumination = renderer._illuminated()[0]
         key = jax.random.fold_in(self._key, self._passes)
         exposure = jnp.asarray(self._log_exposure)
-        return Subject(self._pipeline, self.asset(), illumination, exposure, key)
+        return Subject(renderer._pipeline, asset, illumination, exposure, key)
 
     def _illuminated(self) -> list[Illumination]:
         """Compute incident light, once; one result for each pass of specular light.

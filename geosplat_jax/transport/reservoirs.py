@@ -171,8 +171,9 @@ def _take(values: Array, choice: Int[Array, "R n"]) -> Array:
     return jnp.take_along_axis(values, choice, axis=0)[0]
 
 
-def _cosine(normals: Float[Array, "n 3"], directions: Float[Array, "R n 3"]) -> Array:
-    return jnp.maximum(jnp.sum(normals[None] * directions, axis=-1), 0.0)
+def _cosine(normals: Float[Array, "n 3"], directions: Float[Array, "... n 3"]) -> Array:
+    normals = jnp.expand_dims(normals, range(directions.ndim - normals.ndim))
+    return jnp.maximum(jnp.sum(normals * directions, axis=-1), 0.0)
 
 
 def _own(
@@ -190,8 +191,7 @@ def _own(
     # Every ``count``-th candidate belongs to the same reservoir: they spread over the whole sky.
     shape = (spec.candidates, count, points.normals.shape[0])
     directions, density = directions.reshape(*shape, 3), density.reshape(shape)
-    cosine = jnp.maximum(jnp.sum(points.normals[None, None] * directions, axis=-1), 0.0)
-    target = _brightness(light, directions) * cosine
+    target = _brightness(light, directions) * _cosine(points.normals, directions)
     choice, total = _chosen(uniforms.T, target / (spec.candidates * density))
     weight = safe_divide(total, _take(target, choice))
     return _take(directions, choice), weight
@@ -213,11 +213,6 @@ def _is_open(
     return cast(source.points, directions, index) == OPEN
 
 
-def _balance(terms: list[Array], j: int) -> Array:
-    """Share of source j by the balance heuristic."""
-    return safe_divide(terms[j], jnp.sum(jnp.stack(terms), axis=0))
-
-
 def _joined(
     sources: list[_Source],
     uniforms: Float[Array, "R n"],
@@ -226,30 +221,37 @@ def _joined(
     *,
     traces: bool,
 ) -> _Source:
-    """Choose one of several reservoirs, of which the first is the points' own."""
-    brightness = [_brightness(light, source.directions) for source in sources]
+    """Choose one of K reservoirs, of which the first is the points' own."""
+    all_directions = jnp.stack([source.directions for source in sources])
+    brightness = _brightness(light, all_directions)
 
-    def target(receiver: _Source, k: int, j: int) -> Array:
-        """Target at source k of the sample of source j."""
-        value = brightness[j] * _cosine(receiver.points.normals, sources[j].directions)
-        if traces and k != j:
-            value = jnp.where(_is_open(receiver, sources[j].directions, index), value, 0.0)
-        return value
+    def targets_at(k: int) -> Float[Array, "K R n"]:
+        """Targets at source k of the samples of all sources."""
+        values = brightness * _cosine(sources[k].points.normals, all_directions)
+        if not traces:
+            return values
+        # Its own samples were traced when they were chosen. One call traces all others.
+        others = jnp.delete(all_directions, k, axis=0)
+        is_open = _is_open(sources[k], others.reshape(-1, *others.shape[2:]), index)
+        is_open = jnp.insert(is_open.reshape(others.shape[:-1]), k, True, axis=0)
+        return jnp.where(is_open, values, 0.0)
 
-    own_source, weights = sources[0], []
-    for j, source in enumerate(sources):
-        values = [target(receiver, k, j) for k, receiver in enumerate(sources)]
-        terms = [
-            receiver.confidences[None] * x for receiver, x in zip(sources, values, strict=True)
-        ]
-        weights.append(_balance(terms, j) * values[0] * source.weights)
-    choice, total = _chosen(uniforms, jnp.stack(weights))
-    directions = _take(jnp.stack([source.directions for source in sources]), choice)
-    target_value = _take(jnp.stack(brightness), choice) * _cosine(
-        own_source.points.normals, directions
+    targets = jnp.stack([targets_at(k) for k in range(len(sources))])
+    confidences = jnp.stack([source.confidences for source in sources])
+    # The balance heuristic: row k, column j is what source k could have made of sample j.
+    terms = confidences[:, None, None] * targets
+    own_terms = terms[jnp.arange(len(sources)), jnp.arange(len(sources))]
+    shares = safe_divide(own_terms, jnp.sum(terms, axis=0))
+    weights = shares * targets[0] * jnp.stack([source.weights for source in sources])
+    choice, total = _chosen(uniforms, weights)
+    directions = _take(all_directions, choice)
+    target_value = _take(brightness, choice) * _cosine(sources[0].points.normals, directions)
+    return _Source(
+        directions,
+        safe_divide(total, target_value),
+        jnp.sum(confidences, axis=0),
+        sources[0].points,
     )
-    confidences = jnp.sum(jnp.stack([source.confidences for source in sources]), axis=0)
-    return _Source(directions, safe_divide(total, target_value), confidences, own_source.points)
 
 
 def _offered(
