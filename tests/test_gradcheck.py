@@ -11,6 +11,7 @@ import pytest
 from geosplat_jax import cli
 from geosplat_jax.gradcheck import report
 from geosplat_jax.gradcheck.differences import STEPS, Problem, compare, double_precision
+from geosplat_jax.gradcheck.geometry_stages import adapter_problems
 from geosplat_jax.gradcheck.report import STAGES, check_stage, passes, summary, table
 
 SLOW_STAGES = {
@@ -49,6 +50,17 @@ def test_every_gradient_agrees_with_differences(stage):
     assert not failing_rows, table(failing_rows)
     # A table of zeros would pass, so many of the pairs must truly depend on each other.
     assert np.mean([row.norm > 0 for row in rows]) > 0.4
+
+
+def test_splats_whose_scales_are_differentiated_have_a_size():
+    """Splats on vertices that see their faces from behind would have none, and no gradient."""
+    with double_precision():
+        for problem in adapter_problems(np.random.default_rng(0)):
+            inputs = jax.tree.map(jnp.asarray, problem.inputs)
+            outputs = problem.function(inputs, jax.tree.map(jnp.asarray, problem.constants))
+            if "scales" in outputs:
+                is_real = outputs["opacities"] > 0
+                assert (outputs["scales"][is_real][:, :2] > 1e-2).all()
 
 
 @jax.custom_vjp

@@ -34,6 +34,18 @@ def test_a_cache_chosen_by_the_user_is_respected(monkeypatch, cache_setting):
     assert jax.config.jax_compilation_cache_dir == previous_directory
 
 
+def test_a_user_without_a_home_has_no_cache(monkeypatch, cache_setting):
+    def fails():
+        raise RuntimeError("Could not determine home directory.")
+
+    for name in ("JAX_COMPILATION_CACHE_DIR", "XDG_CACHE_HOME"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(runtime.Path, "home", fails)
+    previous_directory = jax.config.jax_compilation_cache_dir
+    runtime.enable_compilation_cache()
+    assert jax.config.jax_compilation_cache_dir == previous_directory
+
+
 def test_programs_are_forgotten_when_they_hold_too_many_maps(monkeypatch):
     double = jax.jit(lambda x: 2 * x)
     double(jax.numpy.ones(3))

@@ -16,7 +16,8 @@ from geosplat_jax.fit import loop as loop_module
 from geosplat_jax.fit import runtime
 from geosplat_jax.fit import train as train_module
 from geosplat_jax.fit.begin import Anew, Resume
-from geosplat_jax.fit.folder import RunError
+from geosplat_jax.fit.devices import Devices
+from geosplat_jax.fit.folder import RunError, RunFolder
 from geosplat_jax.fit.gradient import _asset, _back, _view_gradient
 from geosplat_jax.fit.listener import Listener
 from geosplat_jax.fit.stages import make_batch, pipeline_at, view_indices
@@ -207,6 +208,35 @@ def test_an_overflowing_step_is_repeated_and_equals_one_with_ample_room(
         # With other buffer sizes, sums have another order, so values are equal up to rounding.
         assert second["loss"] == pytest.approx(first["loss"], rel=1e-4)
         assert second["faces"] == first["faces"]
+
+
+class _Watched(Devices):
+    """Records what fails in actions that all hosts wait for."""
+
+    def __init__(self):
+        self.errors = []
+
+    def together(self, action):
+        try:
+            return action()
+        except OSError as error:
+            self.errors.append(error)
+            raise
+
+
+@pytest.mark.parametrize("place", ["begin", "keep_lines_before", "_write_line", "on_step"])
+def test_an_error_of_the_host_that_writes_reaches_all(dataset, tmp_path, monkeypatch, place):
+    """An error outside of `Devices.together` would leave the other hosts waiting for its result."""
+
+    def fails(*arguments, **options):
+        raise OSError("no space left")
+
+    owner = {"on_step": Listener, "_write_line": train_module}.get(place, RunFolder)
+    monkeypatch.setattr(owner, place, fails)
+    devices = _Watched()
+    with pytest.raises(OSError, match="no space left"):
+        fit(dataset, tiny_config(), tmp_path / "run", listener=Listener(), devices=devices)
+    assert len(devices.errors) == 1
 
 
 def test_a_whole_run_compiles_the_step_once(dataset, tmp_path):

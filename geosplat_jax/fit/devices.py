@@ -490,7 +490,8 @@ def connect_hosts(
     hosts : number of processes; ``auto`` to take it from Slurm, Open MPI, Kubernetes or a TPU pod.
     host : number of this process, from 0.
     coordinator : ADDRESS:PORT of process 0, which all others must be able to reach.
-    patience : seconds without a sign of life after which a process is taken for dead.
+    patience : seconds without a sign of life after which a process is taken for dead, and that a
+        process that has ended waits for the others.
 
     Raises
     ------
@@ -503,7 +504,10 @@ def connect_hosts(
     process_options = {} if hosts == "auto" else {"num_processes": int(hosts), "process_id": host}
     try:
         jax.distributed.initialize(
-            coordinator_address=coordinator, heartbeat_timeout_seconds=patience, **process_options
+            coordinator_address=coordinator,
+            heartbeat_timeout_seconds=patience,
+            shutdown_timeout_seconds=patience,
+            **process_options,
         )
     except (ValueError, RuntimeError) as error:
         message = str(error).splitlines()[0]

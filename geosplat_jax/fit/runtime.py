@@ -108,7 +108,8 @@ def _cpu_flags() -> str:
 def enable_compilation_cache(base: Path | None = None) -> None:
     """Keep compiled programs on disk between runs, apart for every jaxlib and kind of processor.
 
-    Does nothing if ``JAX_COMPILATION_CACHE_DIR`` is set: JAX then uses that folder.
+    Does nothing if ``JAX_COMPILATION_CACHE_DIR`` is set: JAX then uses that folder. Nor does it
+    where the user has no home folder, as in some containers.
 
     Parameters
     ----------
@@ -118,6 +119,9 @@ def enable_compilation_cache(base: Path | None = None) -> None:
         return
     host = f"{platform.machine()} {platform.processor()} {_cpu_flags()}"
     key = f"{importlib.metadata.version('jaxlib')}-{hashlib.sha256(host.encode()).hexdigest()[:12]}"
-    base = base or Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    try:
+        base = base or Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    except RuntimeError:
+        return
     jax.config.update("jax_compilation_cache_dir", str(base / "geosplat_jax" / key))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)

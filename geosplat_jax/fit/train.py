@@ -11,8 +11,9 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 import jax
 import numpy as np
@@ -246,9 +247,15 @@ def fit(
                 devices.together(lambda: is_writer and run.require_free(replace=begin.replace))
                 loop = devices.together(lambda: begin.first_loop(dataset, config, run, devices))
                 budget = None if pacer is None else pacer.budget
-                if is_writer:
-                    run.begin(dataset, config, replace=begin.replace, budget=budget, model=model)
-                    has_begun = True
+                devices.together(
+                    lambda: (
+                        is_writer
+                        and run.begin(
+                            dataset, config, replace=begin.replace, budget=budget, model=model
+                        )
+                    )
+                )
+                has_begun = is_writer
                 if begin.takes_over:
                     loop.save_end()
             else:
@@ -362,6 +369,12 @@ def _keep_pace(loop: Loop, pacer: Pacer, seconds: float | None) -> None:
         loop.retime(adjusted_config)
 
 
+def _write_line(file: TextIO, line: dict[str, Any]) -> None:
+    """Write a line of JSON, so that it is in the file even if the process dies."""
+    file.write(json.dumps(line) + "\n")
+    file.flush()
+
+
 def _train(
     loop: Loop,
     listener: Listener,
@@ -372,8 +385,7 @@ def _train(
     """Make steps until all are done, or ``stop_after``."""
     clock, is_writer = _Clock(loop.config), loop.devices.is_first_host
     loop.on_compile = listener.on_compile
-    if is_writer:
-        loop.folder.keep_lines_before(loop.step)
+    loop.devices.together(lambda: is_writer and loop.folder.keep_lines_before(loop.step))
 
     def last_step() -> int:
         return min(loop.config.total_steps, stop_after or loop.config.total_steps)
@@ -386,8 +398,7 @@ def _train(
             report = loop.advance(step)
             seconds = time.perf_counter() - step_start
             line = _record(report, step, loop, seconds)
-            metrics_file.write(json.dumps(line) + "\n")
-            metrics_file.flush()
+            loop.devices.together(partial(_write_line, metrics_file, line))
             steps_done = step + 1
             if not loop.has_compiled:
                 clock.note(loop.stage.name, seconds)
@@ -396,7 +407,8 @@ def _train(
                 clock.config = loop.config
             config, final_step = loop.config, last_step()
             seconds_left = clock.left(steps_done) if pacer is None else pacer.seconds_left
-            listener.on_step(_progress(line, config, clock.elapsed, seconds_left))
+            progress = _progress(line, config, clock.elapsed, seconds_left)
+            loop.devices.together(partial(listener.on_step, progress))
             is_stopped = loop.devices.any_host(stop_requested())
             if (
                 steps_done % config.run.checkpoint_every == 0

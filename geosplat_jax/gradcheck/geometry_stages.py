@@ -109,7 +109,8 @@ def _tetrahedron(rng: np.random.Generator) -> dict[str, Any]:
     return {"vertices": vertices, "normals": normals}
 
 
-_FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], np.int32)
+_FACES = np.array([[0, 1, 2], [0, 3, 1], [0, 2, 3], [1, 3, 2]], np.int32)
+"""Faces of `_tetrahedron`, outward: splats on vertices (Eq. 12) have no radius on inward ones."""
 
 
 def _mesh(vertices: Any) -> Mesh:

@@ -16,6 +16,7 @@ from geosplat_jax.gradcheck.image_stages import (
 from geosplat_jax.gradcheck.mesh_stages import mesh_problems
 from geosplat_jax.gradcheck.shading_stages import (
     bsdf_problems,
+    face_problems,
     hash_grid_problems,
     light_problems,
     material_problems,
@@ -48,6 +49,7 @@ STAGES: dict[str, Callable[[np.random.Generator], list[Problem]]] = {
     "light": light_problems,
     "splitsum": split_sum_problems,
     "transport": transport_problems,
+    "faces": face_problems,
     "paths": path_problems,
     "projection": projection_problems,
     "rasterizer": rasteriser_problems,

@@ -21,9 +21,9 @@ from geosplat_jax.transport.environment import (
     prefiltered_specular,
 )
 from geosplat_jax.transport.estimators import gather, reflect
-from geosplat_jax.transport.indirect import INDIRECT_MODELS
+from geosplat_jax.transport.indirect import INDIRECT_MODELS, outgoing
 from geosplat_jax.transport.light_sampling import light_sampler
-from geosplat_jax.transport.paths import FaceTable, Leg, path_radiance
+from geosplat_jax.transport.paths import FaceTable, Leg, face_table, path_radiance
 from geosplat_jax.transport.sampling import BLOCKED, SampleCounts, draw_samples
 from geosplat_jax.transport.split_sum import fg_table, split_sum
 
@@ -270,6 +270,32 @@ def transport_problems(rng: np.random.Generator) -> list[Problem]:
         )
 
     return [problem(kind) for kind in ("constant", "harmonics", "traced", "radiometric")]
+
+
+def face_problems(rng: np.random.Generator) -> list[Problem]:
+    """Differentiate what the points of a face give to it: sent light, materials and normals.
+
+    One of the faces has no points, one point has no face, and one is padding.
+    """
+    count, faces = 9, 4
+    inputs = _surface_points(rng, count)
+    inputs["light"] = rng.uniform(0.1, 2.0, (count, 3))
+    outward = jnp.asarray(inputs["normals"])
+    rows = jnp.asarray([-1, *rng.integers(0, faces - 1, count - 1)], jnp.int32)
+    mask = jnp.arange(count) < count - 1
+    points = SurfacePoints(jnp.zeros_like(outward), outward, outward, rows, mask)
+    del inputs["wo"]
+
+    def function(inputs: dict[str, Any], constants: SurfacePoints) -> dict[str, Any]:
+        points = replace(constants, normals=inputs["normals"])
+        table = face_table(points, _materials(inputs), faces)
+        shine = jnp.stack([table.materials.roughness, table.materials.metallic], axis=1)
+        return {
+            "sent light": outgoing(_materials(inputs), inputs["light"], points, faces),
+            "table": jnp.concatenate([table.materials.albedo, shine, table.normals], axis=1),
+        }
+
+    return [Problem("means over faces", function, inputs, points)]
 
 
 def path_problems(rng: np.random.Generator) -> list[Problem]:
