@@ -270,7 +270,8 @@ def test_a_stage_chooses_paths_and_they_say_what_they_need():
         "stages.monte_carlo.transport.later_gradient=light",
     )
     path_settings = config.stage("monte_carlo").transport
-    assert path_settings == PathSettings(bounce_count=3, later_gradient="light")
+    assert isinstance(path_settings, PathSettings)
+    assert (path_settings.bounce_count, path_settings.later_gradient) == (3, "light")
     transport = path_settings.build(LightSpec())
     assert transport.needs_key
     assert transport.uses_rays
