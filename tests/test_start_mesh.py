@@ -307,6 +307,13 @@ def test_negative_indices_count_back_from_their_line(tmp_path, corner):
     np.testing.assert_allclose(np.ptp(mesh.vertices, axis=0), [5.0, 1.0, 1.0])
 
 
+def test_an_index_that_counts_back_too_far_is_refused(tmp_path):
+    path = tmp_path / "mesh.obj"
+    path.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf -3 -2 -4\nv 1 1 1\n")
+    with pytest.raises(ValueError, match="a face counts back 4 rows, where 3 are above it"):
+        read(str(path))
+
+
 @pytest.mark.parametrize("turned_face", [3, 12])
 def test_a_closed_mesh_keeps_its_slivers_if_a_face_is_turned(tmp_path, turned_face):
     """Faces 12 and 13 divide an edge of a box at its middle, where face 12 is a sliver."""

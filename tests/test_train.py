@@ -224,14 +224,14 @@ class _Watched(Devices):
             raise
 
 
-@pytest.mark.parametrize("place", ["begin", "keep_lines_before", "_write_line", "on_step"])
+@pytest.mark.parametrize("place", ["begin", "keep_lines_before", "_tell_step", "on_step"])
 def test_an_error_of_the_host_that_writes_reaches_all(dataset, tmp_path, monkeypatch, place):
     """An error outside of `Devices.together` would leave the other hosts waiting for its result."""
 
     def fails(*arguments, **options):
         raise OSError("no space left")
 
-    owner = {"on_step": Listener, "_write_line": train_module}.get(place, RunFolder)
+    owner = {"on_step": Listener, "_tell_step": train_module}.get(place, RunFolder)
     monkeypatch.setattr(owner, place, fails)
     devices = _Watched()
     with pytest.raises(OSError, match="no space left"):

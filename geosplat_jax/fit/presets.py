@@ -622,9 +622,13 @@ def _of_kinds(values: dict[str, Any], preset: Config) -> Config:
 
 
 def _keeping(old: Any, new: Any, given: Any) -> Any:
-    """Return given settings; those of another kind with the settings that the old kind has, too.
+    """Complete settings of another kind by the values that the old kind has for the same settings.
 
-    ``new`` : all settings that the kinds of ``given`` have.
+    Parameters
+    ----------
+    old : settings of the preset.
+    new : all settings, with the kinds of ``given`` and their defaults.
+    given : settings to complete, in which a section of another kind may hold its kind alone.
     """
     if not all(isinstance(values, dict) for values in (old, new, given)):
         return given

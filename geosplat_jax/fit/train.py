@@ -369,10 +369,11 @@ def _keep_pace(loop: Loop, pacer: Pacer, seconds: float | None) -> None:
         loop.retime(adjusted_config)
 
 
-def _write_line(file: TextIO, line: dict[str, Any]) -> None:
-    """Write a line of JSON, so that it is in the file even if the process dies."""
+def _tell_step(line: dict[str, Any], file: TextIO, progress: Progress, listener: Listener) -> None:
+    """Write the line of a step, so that it stays if the process dies, and tell the listener."""
     file.write(json.dumps(line) + "\n")
     file.flush()
+    listener.on_step(progress)
 
 
 def _train(
@@ -398,7 +399,6 @@ def _train(
             report = loop.advance(step)
             seconds = time.perf_counter() - step_start
             line = _record(report, step, loop, seconds)
-            loop.devices.together(partial(_write_line, metrics_file, line))
             steps_done = step + 1
             if not loop.has_compiled:
                 clock.note(loop.stage.name, seconds)
@@ -408,7 +408,7 @@ def _train(
             config, final_step = loop.config, last_step()
             seconds_left = clock.left(steps_done) if pacer is None else pacer.seconds_left
             progress = _progress(line, config, clock.elapsed, seconds_left)
-            loop.devices.together(partial(listener.on_step, progress))
+            loop.devices.together(partial(_tell_step, line, metrics_file, progress, listener))
             is_stopped = loop.devices.any_host(stop_requested())
             if (
                 steps_done % config.run.checkpoint_every == 0

@@ -131,18 +131,31 @@ def _source(path: Path) -> dict[str, Any]:
 
 
 def _from_start(corner: bytes, counts: Mapping[bytes, int]) -> bytes:
-    """Turn the negative indices of ``v/vt/vn`` into those that count from the start."""
-    return b"/".join(
-        str(count + 1 + int(index)).encode() if index.startswith(b"-") else index
-        for index, count in zip(corner.split(b"/"), counts.values(), strict=False)
-    )
+    """Turn the negative indices of ``v/vt/vn`` into those that count from the start.
+
+    Raises
+    ------
+    ValueError
+        If an index counts back beyond the first.
+    """
+    numbers = []
+    for index, count in zip(corner.split(b"/"), counts.values(), strict=False):
+        number = index
+        if index.startswith(b"-"):
+            number = b"%d" % (count + 1 + int(index))
+            if int(number) < 1:
+                raise ValueError(
+                    f"a face counts back {-int(index)} rows, where {count} are above it"
+                )
+        numbers.append(number)
+    return b"/".join(numbers)
 
 
 def gltf_buffers(path: Path) -> list[Path]:
     """Return the files beside a glTF file that hold its numbers; none for other formats."""
     if path.suffix.lower() != ".gltf":
         return []
-    buffers = _gltf_tree(path).get("buffers", [])
+    buffers = _gltf_tree(path).get("buffers") or []
     names = [buffer.get("uri", "data:") for buffer in buffers if isinstance(buffer, dict)]
     paths = [path.parent / unquote(name) for name in names if not name.startswith("data:")]
     return [path for path in paths if path.is_file()]

@@ -116,7 +116,8 @@ def digest_of(path: str | Path) -> str:
         raise ValueError(f"there is no mesh file {path}")
     digest = hashlib.sha256()
     for part in (path, *gltf_buffers(path)):
-        digest.update(part.read_bytes())
+        with part.open("rb") as file:
+            hashlib.file_digest(file, lambda: digest)
     return digest.hexdigest()[:16]
 
 
