@@ -15,6 +15,7 @@ from geosplat_jax.gradcheck.geometry_stages import adapter_problems
 from geosplat_jax.gradcheck.report import STAGES, check_stage, passes, summary, table
 
 SLOW_STAGES = {
+    "denoiser",
     "mesh",
     "adapter",
     "isosurface",

@@ -1,4 +1,4 @@
-"""Problems of the image: projection, rasteriser and the terms of the loss on images."""
+"""Problems of the image: projection, rasteriser, denoiser and the terms of the loss on images."""
 
 from typing import Any
 
@@ -23,6 +23,7 @@ from geosplat_jax.losses import (
 )
 from geosplat_jax.splats.projection import project
 from geosplat_jax.splats.rasterize import rasterize
+from geosplat_jax.transport.denoise import DenoiseSpec, denoise
 
 _HEIGHT, _WIDTH = 9, 11
 _CAPACITIES = Capacities(visible=128, hits=512, chunks=128)
@@ -111,6 +112,31 @@ def rasteriser_problems(rng: np.random.Generator) -> list[Problem]:
         return {"image": image + (1 - alpha)[..., None] * inputs["background"], "alpha": alpha}
 
     return [Problem("rasteriser", function, inputs)]
+
+
+def denoiser_problems(rng: np.random.Generator) -> list[Problem]:
+    """Differentiate filtered light in the light and in the coverage.
+
+    Depth and albedo are multiplied by the coverage, so that the filter's weights, which are
+    constants by contract, do not change with it. The normals differ enough for weights of all
+    sizes.
+    """
+    shape = (_HEIGHT, _WIDTH)
+    spec = DenoiseSpec(iterations=2)
+    normals = rng.uniform(-0.3, 0.3, (*shape, 3)) + np.array([0.0, 0.0, 1.0])
+
+    def function(inputs: dict[str, Any], constants: Any) -> dict[str, Any]:
+        normals, depth, albedo = constants
+        alpha = inputs["alpha"]
+        filtered = denoise(
+            inputs["light"], alpha, normals, alpha * depth, alpha[..., None] * albedo, spec=spec
+        )
+        return {"filtered light": filtered}
+
+    inputs = {"light": rng.uniform(0.1, 2.0, (*shape, 3)), "alpha": rng.uniform(0.3, 1.0, shape)}
+    constants = (normals, rng.uniform(2.0, 2.2, shape), rng.uniform(0.4, 0.6, (*shape, 3)))
+    arrays = tuple(jnp.asarray(x, jnp.zeros(0).dtype) for x in constants)
+    return [Problem("denoiser", function, inputs, arrays)]
 
 
 def loss_term_problems(rng: np.random.Generator) -> list[Problem]:

@@ -9,6 +9,7 @@ import numpy as np
 from geosplat_jax.gradcheck.differences import STEPS, Comparison, Problem, compare, double_precision
 from geosplat_jax.gradcheck.geometry_stages import adapter_problems, isosurface_problems
 from geosplat_jax.gradcheck.image_stages import (
+    denoiser_problems,
     loss_term_problems,
     projection_problems,
     rasteriser_problems,
@@ -53,6 +54,7 @@ STAGES: dict[str, Callable[[np.random.Generator], list[Problem]]] = {
     "paths": path_problems,
     "projection": projection_problems,
     "rasterizer": rasteriser_problems,
+    "denoiser": denoiser_problems,
     "terms": loss_term_problems,
     "loss": loss_problems,
     "refinement": refinement_problems,
