@@ -117,7 +117,7 @@ class PerPixel(ShadingDomain, kind="per_pixel"):
         attributes = jax.tree.map(gather, asset.attributes)
         materials = attributes.materials
         footprints = pipeline.project(
-            gather(splats.means), gather(splats.quats), gather(splats.scales, padding=1.0), camera
+            gather(splats.means), gather(splats.quats), gather(splats.scales), camera
         )
         channels = {
             "normal": gather(splats.normals),

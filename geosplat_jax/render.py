@@ -223,9 +223,7 @@ class PerSplat(ShadingDomain, kind="per_splat"):
             illumination.take(lists.index),
             asset.index,
         )
-        footprints = pipeline.project(
-            means, gather(splats.quats), gather(splats.scales, padding=1.0), camera
-        )
+        footprints = pipeline.project(means, gather(splats.quats), gather(splats.scales), camera)
         channels = {
             "rgb": shaded.rgb,
             "albedo": materials.albedo,

@@ -548,3 +548,27 @@ def test_the_unit_of_the_world_does_not_matter(factor):
     for k, power in enumerate((1, 0, 1, 0, 0)):
         error = np.linalg.norm(np.asarray(scaled_gradient[k]) * factor**power - gradient[k])
         assert error <= 1e-4 * np.linalg.norm(gradient[k])
+
+
+def test_the_gradient_of_the_camera_is_finite_in_a_tiny_world():
+    """Padding rows lie at the origin, which the camera of a tiny world nearly touches."""
+
+    @jax.jit
+    def pull(inputs, matrix, near):
+        def drawn(matrix):
+            settings = camera() | {"world_to_camera": matrix}
+            image, alpha, _ = rasterize(
+                *inputs, jnp.ones(COUNT, bool), **settings, near=near, capacities=AMPLE
+            )
+            return scalar(image, alpha)
+
+        return jax.grad(drawn)(matrix)
+
+    inputs, matrix = scene(10), camera()["world_to_camera"]
+    factor = 2.0**-30
+    tiny_inputs = (inputs[0] * factor, inputs[1], inputs[2] * factor, *inputs[3:])
+    expected = pull(inputs, matrix, 0.01)
+    gradient = pull(tiny_inputs, matrix.at[:3, 3].multiply(factor), 0.01 * factor)
+    np.testing.assert_array_equal(gradient.at[:3, 3].multiply(factor), expected)
+    assert all_finite(gradient)
+    assert (jnp.abs(gradient[:3]) > 0).all()

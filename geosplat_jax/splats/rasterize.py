@@ -175,7 +175,7 @@ def rasterize(
     splats = project(
         lists.gather(means),
         lists.gather(quats),
-        lists.gather(scales, padding=1.0),
+        lists.gather(scales),
         world_to_camera=world_to_camera,
         intrinsics=intrinsics,
         near=near,

@@ -62,11 +62,9 @@ class TileLists(eqx.Module):
     chunk_tiles: Int[Array, " chunks"]
     usage: Usage
 
-    def gather(
-        self, values: Shaped[Array, "N ..."], *, padding: float = 0.0
-    ) -> Shaped[Array, "visible ..."]:
-        """Gather the rows of the visible Gaussians; see `gather_visible`."""
-        return gather_visible(self.index, values, padding=padding)
+    def gather(self, values: Shaped[Array, "N ..."]) -> Shaped[Array, "visible ..."]:
+        """Gather the rows of the visible Gaussians, zeros on padding; see `gather_visible`."""
+        return gather_visible(self.index, values)
 
 
 def gather_visible(
