@@ -137,7 +137,6 @@ def refined_cameras(
     if geometry is not None:
         geometry.notes(dataset)
     provenance = {
-        "scene": str(Path(scene).resolve()),
         "reading": options,
         "views": [dataset.train.fingerprint(), dataset.test.fingerprint()],
         "masks": [np.round(views.coverage, 6).tolist() for views in (dataset.train, dataset.test)],

@@ -27,6 +27,7 @@ from geosplat_jax.io.checkpoints import CheckpointError
         (["--force"], Anew(replace=True)),
         (["--resume"], Resume()),
         (["--from", "runs/a", "--stage", "refine"], TakeOver(Path("runs/a"), "refine")),
+        (["--from", "a", "--stage", "b", "--force"], TakeOver(Path("a"), "b", replace=True)),
     ],
 )
 def test_options_say_how_a_run_begins(options, expected):

@@ -543,6 +543,8 @@ def test_a_budget_that_is_resumed_takes_no_other_settings(dataset, tmp_path, cap
     resume_command = ["train", "examples/duck", "--output", str(tmp_path / "run"), "--resume"]
     assert cli.main([*resume_command, "--budget", "2min"]) == 2
     assert "was begun with; leave --budget" in " ".join(capsys.readouterr().err.split())
+    assert cli.main([*resume_command, "--model", "auto"]) == 2
+    assert "was begun with a budget; leave --model out" in " ".join(capsys.readouterr().err.split())
 
 
 def test_the_command_of_a_budget_goes_on_with_resume_alone(dataset, tmp_path, monkeypatch):

@@ -103,6 +103,7 @@ def test_rounds_are_beside_the_run_wherever_that_is(tmp_path, monkeypatch):
 def test_rounds_that_are_done_are_not_made_again(made, tmp_path):
     refined_cameras("scene", tmp_path / "fox", rounds=1)
     assert refined_cameras("scene", tmp_path / "fox", rounds=1).exists()
+    assert refined_cameras("where the scene is now", tmp_path / "fox", rounds=1).exists()
     assert len(made) == 1
 
 

@@ -585,7 +585,10 @@ def test_the_split_of_nerfstudio_is_taken(copied):
         ({"applied_transform": np.full((3, 4), np.nan).tolist()}, "must be 3 x 4 finite numbers"),
         ({"camera_model": "EQUIRECTANGULAR"}, "frame 0 of .* must be one of PINHOLE,.*EQUIRECT"),
         ({"camera_model": ["OPENCV"]}, "must be one of PINHOLE"),
-        ({"is_latlong": True}, "frame 0 of .* has is_latlong, a projection that is not supported"),
+        ({"latlong": True}, "frame 0 of .* has latlong, a projection that is not supported"),
+        ({"equirectangular": True}, "frame 0 of .* has equirectangular, a projection that is not"),
+        ({"orthographic": True}, "frame 0 of .* has orthographic, a projection that is not"),
+        ({"ftheta_p0": 0.0}, "frame 0 of .* has ftheta_p0, a projection that is not supported"),
         ({"k1": np.nan}, "'k1' of frame 0 of .* must be a finite number, got nan"),
         ({"k2": "0.1"}, "'k2' of frame 0 of .* must be a finite number"),
         ({"distortion_params": [0.1, 0.2]}, "'distortion_params' of frame 0 .* the 6 numbers k1"),
@@ -617,6 +620,76 @@ def test_what_a_transforms_file_names_must_be_there(copied):
     edit(root, lambda content: content["frames"][0].update(mask_path=3))
     edit(root, lambda content: content["frames"][0].update(file_path="images/view_06.png"))
     refuses(root, "'mask_path' of .* must be a name")
+
+
+def test_frames_that_were_sorted_out_for_their_blur_are_left_out(copied):
+    root = copied("transforms")
+    (root / "images" / "view_05.png").unlink()
+    edit(root, lambda content: content["frames"][0].update(sharpness=20.5))
+    dataset = load(root)
+    names = dataset.train.names + dataset.test.names
+    assert sorted(names) == [f"view_{number:02d}" for number in range(COUNT) if number != 5]
+    assert dataset.notes[0].startswith("1 frames of transforms.json have no image")
+    (root / "masks" / "m6.png").unlink()
+    refuses(root, r"the mask of \./images/view_06\.png .* has no file m6\.png", MissingFileError)
+    shutil.rmtree(root / "images")
+    refuses(root, "has none of the images that transforms.json names", MissingFileError)
+
+
+def write_llff(root, *, scale=1):
+    """Write rows whose sizes and focal lengths are ``scale`` times those of the photographs."""
+    names = write_photographs(root, "images")
+    rows = []
+    for number, pose in enumerate(opengl_poses()):
+        right, up, backwards, position = pose[:3].T
+        size = scale * np.array([*size_of(number), LENS.fx])
+        matrix = np.stack([-up, right, backwards, position, size], axis=-1)
+        rows.append([*matrix.ravel(), 2.0, 6.0])
+    np.save(root / "poses_bounds.npy", np.array(rows))
+    return names
+
+
+@pytest.mark.parametrize("scale", [1, 4])
+def test_llff_has_a_row_for_every_photograph(tmp_path, scale):
+    write_llff(tmp_path, scale=scale)
+    dataset = load(tmp_path)
+    assert dataset.layout == "llff"
+    for views in (dataset.train, dataset.test):
+        numbers = [number_of(name) for name in views.names]
+        np.testing.assert_allclose(views.camera_to_world, opengl_poses()[numbers], atol=1e-6)
+        for number, intrinsics in zip(numbers, views.intrinsics, strict=True):
+            height, width = size_of(number)
+            lens = [[LENS.fx, 0, width / 2], [0, LENS.fx, height / 2], [0, 0, 1]]
+            np.testing.assert_allclose(intrinsics, lens, atol=1e-5)
+        assert (views.images[..., 3].max((1, 2)) == 1).all()
+    assert len(dataset.test) == 2
+
+
+def test_masks_of_llff_may_have_names_of_their_own(tmp_path):
+    write_llff(tmp_path)
+    expected = load(tmp_path).train.images
+    for number, path in enumerate(sorted((tmp_path / "masks").iterdir())):
+        path.rename(path.with_name(f"{number:03d}.png"))
+    np.testing.assert_array_equal(load(tmp_path).train.images, expected)
+
+
+def test_a_wrong_table_of_llff_is_named(tmp_path):
+    write_llff(tmp_path)
+    file = tmp_path / "poses_bounds.npy"
+    table = np.load(file)
+    for wrong, message in (
+        (table[:-1], r"17 numbers for each of the 10 images in .*images, got .* \(9, 17\)"),
+        (table[:, :-1], r"got an array of shape \(10, 16\)"),
+        (table * np.where(np.arange(17) == 14, -1, 1), "'f' of row 0 of .* must be a positive"),
+        (table * np.where(np.arange(17) == 4, 1.001, 1), "'h' of row 0 .* whole number"),
+        (table * np.where(np.arange(17) == 2, np.nan, 1), "row 0 of .* 17 finite numbers"),
+        (table * np.where(np.arange(17) % 5 == 1, -1, 1), "row 0 of .* mirrors space"),
+        (np.array([None]), "poses_bounds.npy is damaged"),
+    ):
+        np.save(file, wrong, allow_pickle=True)
+        refuses(tmp_path, message)
+    file.write_bytes(file.read_bytes()[:60])
+    refuses(tmp_path, "poses_bounds.npy is damaged")
 
 
 def test_distortion_params_and_keys_say_the_same(tmp_path):

@@ -269,9 +269,10 @@ def test_a_first_stage_that_does_not_fit_leaves_the_folder_free(scene, tmp_path,
         assert train(folder, *arguments, scene=scene) == 2
         assert "holds no checkpoint to take the stage split_sum from" in capsys.readouterr().err
         assert [path.name for path in folder.iterdir() if path.name != ".lock"] == []
-    with pytest.raises(SystemExit):
-        train(folder, *arguments, "--resume", scene=scene)
-    assert "not allowed with argument" in capsys.readouterr().err
+    assert train(folder, *arguments, "--resume", scene=scene) == 2
+    assert "--from begins a new run, which --resume does not allow" in capsys.readouterr().err
+    assert train(source_folder, *arguments, "--force", scene=scene) == 2
+    assert "--force would remove the run that --from reads" in capsys.readouterr().err
     assert train(folder, *arguments[:-2], scene=scene) == 2
     assert "--from RUN and --stage NAME belong together" in capsys.readouterr().err
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from geosplat_jax.core.settings import as_written
 from geosplat_jax.deferred import PerPixel
 from geosplat_jax.fit.config import (
     Config,
@@ -48,6 +49,24 @@ def test_every_setting_says_what_it_means(preset):
     lines = all_settings(make_config(preset))
     assert len({path for path, *_ in lines}) == len(lines) > 100
     assert [path for path, _, _, meaning in lines if not meaning] == []
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_every_setting_is_written_as_it_is_set(preset):
+    pace = "stages.split_sum.pace=[{step=0,speed=0.5},{step=50,speed=0.75}]"
+    config = make_config(
+        preset, overrides=(pace, "stages.monte_carlo.transport.denoise.depth_sigma=inf")
+    )
+    rows = [(path, as_written(value)) for path, value, *_ in all_settings(config)]
+    written = dict(rows)
+    assert written["stages.split_sum.pace"] == (
+        "[{step = 0, speed = 0.5}, {step = 50, speed = 0.75}]"
+    )
+    assert written["stages.monte_carlo.enter"].startswith("[{kind = ")
+    assert written["stages.monte_carlo.transport.denoise.depth_sigma"] == "inf"
+    # A stage has its name from its place; kinds and names of presets are not single settings.
+    overrides = [f"{path}={text}" for path, text in rows if not path.endswith(".name")]
+    assert make_config(preset, overrides=tuple(overrides)) == config
 
 
 def test_presets_carry_the_numbers_of_the_paper_and_of_the_authors_code():

@@ -199,7 +199,9 @@ def test_the_mesh_of_a_lambertian_run_is_rough_and_no_metal(tmp_path):
     path = tmp_path / "mesh.glb"
     arrays = (np.asarray(x, np.float32) for x in (mesh.vertices, mesh.vertex_normals))
     vertices, normals = arrays
-    export_mesh_glb(path, vertices, np.asarray(mesh.faces), normals, sampler, texture_size=32)
+    settings = {"has_specular": sampler.has_specular, "texture_size": 32}
+    export_mesh_glb(path, vertices, np.asarray(mesh.faces), normals, sampler, **settings)
+    assert b'"KHR_materials_specular":{"specularFactor":0.0}' in path.read_bytes()
     (loaded_mesh,) = trimesh.load(path).geometry.values()
     packed = np.asarray(loaded_mesh.visual.material.metallicRoughnessTexture)
     np.testing.assert_array_equal(packed[..., 1], 255)

@@ -11,6 +11,8 @@ import pytest
 from PIL import Image
 
 from geosplat_jax.cli import main
+from geosplat_jax.fit.budget import plan
+from geosplat_jax.fit.config import Budget
 from geosplat_jax.fit.folder import RunError, RunFolder
 from geosplat_jax.fit.presets import between_qualities, make_config
 from geosplat_jax.io.checkpoints import save_checkpoint
@@ -333,6 +335,14 @@ def test_settings_between_two_levels_are_said_beside_the_standard_ones():
     assignments = re.findall(r"--set '?([^ ']+)", text)
     rebuilt_config = make_config("default", "standard", overrides=tuple(assignments))
     assert replace(rebuilt_config, quality=config.quality) == config
+
+
+def test_the_command_of_a_budget_names_its_paces():
+    planned = plan(Budget(600.0), (200, 200), slowness=1.0)
+    assert planned.config.stages[0].pace
+    text, is_whole = command({"scene": "s", "dataset": {}}, planned.config)
+    assert is_whole
+    assert "stages.split_sum.pace=[{step = 0, speed = " in text
 
 
 def test_the_command_of_a_run_from_a_mesh_names_the_file(tmp_path):

@@ -299,6 +299,16 @@ def test_radiance_that_is_not_radiance_is_refused(tmp_path, monkeypatch, value):
         load_light(path)
 
 
+def test_a_little_negative_radiance_is_set_to_zero(tmp_path, monkeypatch):
+    """As filters leave it that resized the map."""
+    pixels = np.full((4, 8, 3), 100.0, np.float32)
+    pixels[1, 2] = -1.0
+    monkeypatch.setattr("geosplat_jax.report.relight.read_stored", lambda path: pixels.copy())
+    with pytest.warns(RuntimeWarning, match=r"3 values of any\.exr are negative and are set to"):
+        radiance = load_light("any.exr").radiance
+    np.testing.assert_array_equal(radiance, np.maximum(pixels, 0))
+
+
 def test_alpha_of_a_map_means_nothing(tmp_path):
     pixels = np.full((4, 8, 4), 2.0, np.float32)
     pixels[..., 3] = 0.0

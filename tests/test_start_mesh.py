@@ -14,6 +14,7 @@ from geosplat_jax.io.meshes import (
     _require_convex,
     longest_edge,
     nondegenerate,
+    read_mesh,
     signed_volume,
     split_long_edges,
     surface_area,
@@ -207,6 +208,43 @@ def test_faces_of_many_corners_are_read_if_they_are_convex(tmp_path):
             mesh = read(str(path))
             assert len(mesh.faces) == 4
             assert surface_area(mesh.vertices, mesh.faces) == pytest.approx(1.5 * np.sqrt(3))
+
+
+@pytest.mark.parametrize("is_binary", [False, True])
+def test_faces_of_many_corners_in_ply_must_be_convex(tmp_path, is_binary):
+    path = tmp_path / "plate.ply"
+    square = [(0, 0), (2, 0), (2, 2), (0, 2)]
+    dart = [(0, 0), (2, 0), (0.5, 0.5), (0, 2)]
+    for outline in (square, dart):
+        kind = "binary_little_endian" if is_binary else "ascii"
+        header = (
+            f"ply\nformat {kind} 1.0\nelement vertex 4\nproperty float x\nproperty float y\n"
+            "property float z\nelement face 1\nproperty list uchar int vertex_indices\nend_header\n"
+        )
+        numbers = "".join(f"{x} {y} 0\n" for x, y in outline) + "4 0 1 2 3\n"
+        body = numbers.encode()
+        if is_binary:
+            body = np.float32([(*p, 0) for p in outline]).tobytes() + b"\4"
+            body += np.int32([0, 1, 2, 3]).tobytes()
+        path.write_bytes(header.encode() + body)
+        if outline is square:
+            assert surface_area(*read_mesh(path)) == pytest.approx(4.0)
+        else:  # turned, so that the fan starts at a corner beside the concave one
+            turned = header.encode() + body.replace(
+                np.int32([0, 1, 2, 3]).tobytes(), np.int32([1, 2, 3, 0]).tobytes()
+            ).replace(b"4 0 1 2 3", b"4 1 2 3 0")
+            path.write_bytes(turned)
+            with pytest.raises(ValueError, match=r"plate\.ply has 1 faces that are not convex"):
+                read_mesh(path)
+
+
+def test_names_in_an_obj_may_have_any_encoding(tmp_path):
+    path = tmp_path / "chair.obj"
+    text = "o Stuhl_f\u00fcr_K\u00fcche\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf %s\n"
+    for corners in ("1 2 3", "-3 -2 -1"):
+        path.write_bytes((text % corners).encode("latin-1"))
+        vertices, faces = read_mesh(path)
+        np.testing.assert_array_equal(vertices[faces[0]], [[0, 0, 0], [1, 0, 0], [0, 1, 0]])
 
 
 def test_corners_on_a_straight_side_and_lines_that_go_on_are_no_faults(tmp_path):
@@ -528,14 +566,20 @@ def test_a_vertex_of_no_face_may_lie_anywhere(tmp_path):
         assert len(read_start(str(path), digest_of(path)).faces) == len(faces)
 
 
-@pytest.mark.parametrize("name", ["KHR_draco_mesh_compression", "KHR_mesh_quantization"])
+@pytest.mark.parametrize(
+    "name", ["KHR_draco_mesh_compression", "KHR_mesh_quantization", "sparse accessors"]
+)
 def test_a_compressed_file_is_refused_by_name(tmp_path, name):
     path = tmp_path / "ball.glb"
 
     def packed(tree):
-        tree["extensionsRequired"] = [name]
+        tree["extensionsRequired"] = ["KHR_materials_specular"]
+        if name == "sparse accessors":
+            tree["accessors"][1]["sparse"] = {"count": 1}
+        else:
+            tree["extensionsRequired"].append(name)
 
     scene = trimesh.Scene(trimesh.creation.icosphere(1))
     path.write_bytes(trimesh.exchange.gltf.export_glb(scene, tree_postprocessor=packed))
-    with pytest.raises(ValueError, match=f"is compressed .{name}.*without compression"):
+    with pytest.raises(ValueError, match=f"needs {name}, which .*without compression"):
         read_start(str(path), digest_of(path))

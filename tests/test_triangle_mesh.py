@@ -262,6 +262,8 @@ def test_a_run_starts_from_the_file_says_so_and_resumes_bit_for_bit(dataset, fil
     read_start.cache_clear()
     resumed_config = make_config(mesh=mesh_of_run(RunFolder(tmp_path / "halves")), overrides=SMALL)
     leaves_equal(whole_state, fit(dataset, resumed_config, tmp_path / "halves", begin=Resume()))
+    # The same mesh at another place is the same mesh.
+    leaves_equal(whole_state, fit(dataset, config, tmp_path / "halves", begin=Resume()))
     # Reading a finished run does not need the file either.
     trained = Run(tmp_path / "whole").trained
     leaves_equal(trained.params, whole_state.params)

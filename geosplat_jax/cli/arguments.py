@@ -163,7 +163,7 @@ def _add_train(train: argparse.ArgumentParser) -> None:
     start_group.add_argument(
         "--force", action="store_true", help="replace the run in the output folder"
     )
-    start_group.add_argument(
+    train.add_argument(
         "--from",
         dest="source",
         type=Path,

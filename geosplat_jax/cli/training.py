@@ -2,6 +2,7 @@
 
 import argparse
 import os
+import shlex
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -155,7 +156,11 @@ def _require_no_settings(
 def _request_of(arguments: argparse.Namespace, folder: RunFolder) -> _Request:
     """Determine what to do from the options, or from the record of a run that is resumed."""
     recorded_budget = folder.budget() if arguments.resume and folder.exists else None
+    if arguments.memory is not None and arguments.budget is None and recorded_budget is None:
+        raise UsageError("--memory belongs to --budget")
     if recorded_budget is not None:
+        if arguments.model is not None:
+            raise UsageError(f"{folder} was begun with a budget; leave --model out")
         limits, chooses_size = (arguments.budget, arguments.memory), arguments.downscale == "auto"
         if limits not in ((None, None), (recorded_budget.seconds, recorded_budget.memory)):
             raise UsageError(
@@ -174,8 +179,6 @@ def _request_of(arguments: argparse.Namespace, folder: RunFolder) -> _Request:
     if arguments.model is not None and (arguments.budget or arguments.source):
         raise UsageError("--model auto chooses for a whole training; leave --budget and --from out")
     if arguments.budget is None:
-        if arguments.memory is not None:
-            raise UsageError("--memory belongs to --budget")
         mesh = mesh_of_run(folder) if arguments.resume else None
         config, model = config_from(arguments, mesh), None
         if arguments.model is not None:
@@ -285,7 +288,7 @@ def _state_of(path: Path) -> tuple[int, int] | None:
 def begin_from(arguments: argparse.Namespace) -> Begin:
     """Return how a run begins by the arguments: anew, resumed, or from stages of another run."""
     if arguments.source is not None:
-        return TakeOver(arguments.source, arguments.stage)
+        return TakeOver(arguments.source, arguments.stage, replace=arguments.force)
     return Resume() if arguments.resume else Anew(replace=arguments.force)
 
 
@@ -328,11 +331,15 @@ def train(arguments: argparse.Namespace) -> None:
             "--refine-cameras trains before the run itself, which --budget and --from do not "
             "allow; leave --budget and --from out"
         )
+    if arguments.source is not None and arguments.resume:
+        raise UsageError("--from begins a new run, which --resume does not allow; leave one out")
     if arguments.white_balance and arguments.refine_cameras is None:
         raise UsageError("--white-balance belongs to --refine-cameras")
     require_place(arguments.csv, "--csv")
     devices = _devices(arguments)
     folder = arguments.output or Path("runs") / arguments.scene.resolve().name
+    if arguments.force and arguments.source and arguments.source.resolve() == folder.resolve():
+        raise UsageError("--force would remove the run that --from reads; take another --output")
     request = _request_of(arguments, RunFolder(folder))
     config, reading = request.config, dict(request.reading)
     run_folder = RunFolder(folder)
@@ -376,4 +383,5 @@ def train(arguments: argparse.Namespace) -> None:
     if request.model is not None:
         _say_model(run.folder.record().get("model"))
     seconds = (run.folder.training() or {})["seconds_total"]
-    say(f"trained in {seconds:.0f} s; next: geosplat-jax evaluate {folder}")
+    next_command = shlex.join(["geosplat-jax", "evaluate", str(folder)])
+    say(f"trained in {seconds:.0f} s; next: {next_command}")

@@ -188,8 +188,16 @@ def from_plain(kind: type[_Class], values: Any, where: str = "") -> _Class:
 
 
 def as_written(value: Any) -> str:
-    """Write the plain value of a setting as ``--set`` takes it."""
-    return NONE if value is None else json.dumps(value)
+    """Write the plain value of a setting as ``--set`` takes it: in TOML, and None as ``none``."""
+    if value is None:
+        return NONE
+    if isinstance(value, dict):
+        present = {name: item for name, item in value.items() if item is not None}
+        return f"{{{', '.join(f'{name} = {as_written(item)}' for name, item in present.items())}}}"
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(map(as_written, value))}]"
+    # JSON has another name for infinity.
+    return str(value) if isinstance(value, float) else json.dumps(value)
 
 
 def first_line(error: Exception) -> str:

@@ -539,6 +539,8 @@ def changed_settings(
 ) -> dict[str, tuple[Any, Any]]:
     """Map every setting in which two configurations differ to both values.
 
+    Start meshes with the same content are the same, wherever their files are.
+
     ``stages`` : names of the stages to compare, by default all. What all stages share is always
     compared.
     """
@@ -550,6 +552,8 @@ def changed_settings(
         return _flat(values)
 
     left, right = flat(first), flat(second)
+    if left.get("geometry.digest") and left["geometry.digest"] == right.get("geometry.digest"):
+        left["geometry.path"] = right["geometry.path"]
     names = sorted(set(left) | set(right))
     return {n: (left.get(n), right.get(n)) for n in names if left.get(n) != right.get(n)}
 

@@ -16,6 +16,7 @@ from geosplat_jax.io.images import MissingFileError, SceneError, image_size, wid
 from geosplat_jax.io.layouts.blended_mvs import is_blended_mvs, list_blended_mvs
 from geosplat_jax.io.layouts.colmap import is_colmap, list_colmap
 from geosplat_jax.io.layouts.idr import is_idr, list_idr
+from geosplat_jax.io.layouts.llff import is_llff, list_llff
 from geosplat_jax.io.layouts.nerf_synthetic import (
     is_nerf_synthetic,
     is_shiny_blender,
@@ -47,6 +48,7 @@ LAYOUTS: dict[str, Layout] = {
     "nerf_synthetic": Layout(is_nerf_synthetic, list_nerf_synthetic),
     "transforms": Layout(is_transforms, list_transforms_capture),
     "colmap": Layout(is_colmap, list_colmap),
+    "llff": Layout(is_llff, list_llff),
     "idr": Layout(is_idr, list_idr),
     "blended_mvs": Layout(is_blended_mvs, list_blended_mvs),
 }
@@ -360,9 +362,9 @@ def recognise_layout(root: Path) -> str:
     raise SceneError(
         f"{root} has no known layout; expected transforms_train.json (NeRF-synthetic, Shiny "
         "Blender, Synthetic4Relight, Stanford-ORB), folders train_000, test_000, ... (TensoIR), "
-        "transforms.json (nerfstudio, instant-ngp, nvdiffrec), sparse/0 (COLMAP), cameras*.npz "
-        "(IDR, NeuS) or cams/00000000_cam.txt (BlendedMVS); geosplat-jax poses finds the cameras "
-        "of photographs"
+        "transforms.json (nerfstudio, instant-ngp), sparse/0 (COLMAP), poses_bounds.npy (LLFF, "
+        "nvdiffrec), cameras*.npz (IDR, NeuS) or cams/00000000_cam.txt (BlendedMVS); geosplat-jax "
+        "poses finds the cameras of photographs"
     )
 
 

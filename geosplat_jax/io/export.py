@@ -52,6 +52,9 @@ materials, and copies of these."""
 # glTF's targets of a buffer: vertex attributes and indices.
 _VERTEX_BUFFER, _INDEX_BUFFER = 34962, 34963
 
+_SPECULAR = "KHR_materials_specular"
+"""Extension of glTF that scales the specular lobe of dielectrics."""
+
 _SAMPLES_PER_CALL = 1 << 16
 _VIEWERS_SIGNS = np.array([(-1.0) ** m for degree in (1, 2, 3) for m in range(-degree, degree + 1)])
 """Signs (-1)^m of the harmonics of degree 1 to 3 that viewers expect: the Condon-Shortley phase."""
@@ -136,11 +139,15 @@ def _checked_mesh(
     return vertices[vertex_rows], rows.reshape(-1, 3).astype(np.int32), normals[vertex_rows], info
 
 
-def _write_glb(path: str | Path, mesh: trimesh.Trimesh) -> None:
+def _write_glb(path: str | Path, mesh: trimesh.Trimesh, has_specular: bool) -> None:
     """Write one mesh with its normals, and declare each buffer as vertices or indices."""
 
     def complete(tree: dict) -> None:
         _standardize(tree)
+        if not has_specular:
+            tree["extensionsUsed"] = [_SPECULAR]
+            for material in tree["materials"]:
+                material["extensions"] = {_SPECULAR: {"specularFactor": 0.0}}
         for primitive in (p for part in tree["meshes"] for p in part["primitives"]):
             for accessor in primitive["attributes"].values():
                 view = tree["accessors"][accessor]["bufferView"]
@@ -193,7 +200,7 @@ _OBJ_MAPS = {
 """Keywords of an MTL material that name its textures."""
 
 
-def _write_obj(path: str | Path, mesh: trimesh.Trimesh) -> None:
+def _write_obj(path: str | Path, mesh: trimesh.Trimesh, has_specular: bool) -> None:
     """Write a textured mesh as OBJ, its material beside it as MTL, and its textures as PNG.
 
     The original format has no roughness and metallic; their grey maps, ``map_Pr`` and ``map_Pm``,
@@ -201,7 +208,7 @@ def _write_obj(path: str | Path, mesh: trimesh.Trimesh) -> None:
     """
     path, visual = Path(path), mesh.visual
     assert isinstance(visual, TextureVisuals)
-    lines = ["newmtl material", "Kd 1 1 1", "Pr 1", "Pm 1"]
+    lines = ["newmtl material", "Kd 1 1 1", "Pr 1", "Pm 1", *([] if has_specular else ["Ks 0 0 0"])]
     lines += [f"{_OBJ_MAPS[name]} {file}" for name, file in _write_textures(path, mesh).items()]
     with written_aside(path.with_suffix(".mtl")) as temporary_path:
         temporary_path.write_text("\n".join(lines) + "\n", encoding="utf-8")
@@ -352,6 +359,7 @@ def export_mesh_glb(
     normals: Float[Array | np.ndarray, "W 3"],
     sample_materials: SampleMaterials,
     *,
+    has_specular: bool = True,
     vertex_colors: bool = False,
     texture_size: int = 1024,
     obj_path: str | Path | None = None,
@@ -375,6 +383,8 @@ def export_mesh_glb(
     normals : (V, 3) unit shading normals.
     sample_materials : function from world points (N, 3) to albedo (N, 3) linear, roughness (N,) and
         metallic (N,); always called with the same N.
+    has_specular : False for a Lambertian surface: dielectrics have no specular lobe
+        (``KHR_materials_specular``; in OBJ ``Ks 0 0 0``, in USD a refractive index of 1).
     vertex_colors : write colours at the vertices instead of textures.
     texture_size : width and height of the textures, texels.
     obj_path : also write the mesh and its textures as OBJ, with MTL and PNG files beside it.
@@ -425,16 +435,17 @@ def export_mesh_glb(
     double_sided = not info["closed"]
     if vertex_colors:
         mesh = _vertex_colored(vertices, faces, normals, sample_materials, double_sided)
-        _write_glb(path, mesh)
+        _write_glb(path, mesh, has_specular)
     else:
         mesh, baking = _textured(
             vertices, faces, normals, sample_materials, double_sided, texture_size, fine
         )
-        _write_glb(path, mesh)
+        _write_glb(path, mesh, has_specular)
         if obj_path is not None:
-            _write_obj(obj_path, mesh)
+            _write_obj(obj_path, mesh, has_specular)
         if usd_path is not None:
-            write_usd(usd_path, mesh, _write_textures(Path(usd_path), mesh, mark="_usd"))
+            textures = _write_textures(Path(usd_path), mesh, mark="_usd")
+            write_usd(usd_path, mesh, textures, has_specular=has_specular)
         info |= baking
     info |= {"vertices": len(mesh.vertices), "faces": len(mesh.faces)}
     return info | {"seconds": time.perf_counter() - start}

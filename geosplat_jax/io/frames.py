@@ -6,6 +6,7 @@ inside the scene folder.
 """
 
 import os
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -407,6 +408,38 @@ def images_in(root: Path, folders: tuple[str, ...]) -> list[Path]:
         names = " or ".join(f"{name}/" for name in folders)
         raise MissingFileError(f"{root} has no images in {names}; add them")
     return [existing(root, [path], path.name) for path in images]
+
+
+def paired_masks(root: Path, images: list[Path]) -> list[Path | None]:
+    """Pair masks with images in the order of their numbers if no mask is named after its image.
+
+    Scenes of DTU have ``image/000000.png`` beside ``mask/000.png``. If masks are named after their
+    images, or there are none, all results are None: `captured_frame` finds masks by name.
+
+    Raises
+    ------
+    SceneError : there are not as many masks as images.
+    """
+    folder = next((root / name for name in MASK_FOLDERS if (root / name).is_dir()), None)
+    if folder is None or any(beside_images(root, image, MASK_FOLDERS) for image in images):
+        return [None] * len(images)
+    files = images_in(root, (folder.name,))
+    if len(files) != len(images):
+        raise SceneError(
+            f"{folder} has {len(files)} masks for {len(images)} images, and none is named after "
+            "its image; they belong together by number"
+        )
+    masks: list[Path | None] = [None] * len(images)
+    by_number = sorted(range(len(images)), key=lambda k: _number(images[k]))
+    for k, file in zip(by_number, sorted(files, key=_number), strict=True):
+        masks[k] = file
+    return masks
+
+
+def _number(path: Path) -> tuple[int, str]:
+    """Return the last number in a file's name, to sort by, and the name."""
+    digits = re.findall(r"\d+", path.stem)
+    return (int(digits[-1]) if digits else -1, path.stem)
 
 
 def split_capture(frames: Sequence[Frame], *, notes: tuple[str, ...] = ()) -> Listing:

@@ -20,7 +20,7 @@ _LONGEST = 1e9
 _RADIAL, _TANGENTIAL = ("k1", "k2", "k3", "k4"), ("p1", "p2")
 _PERSPECTIVE_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
 _FISHEYE_MODELS = ("OPENCV_FISHEYE",)
-_OTHER_PROJECTIONS = ("ftheta_p0", "is_latlong", "is_equirectangular", "is_orthographic")
+_OTHER_PROJECTIONS = ("ftheta_p0", "latlong", "equirectangular", "orthographic")
 """Keys by which instant-ngp marks projections without a focal length."""
 
 
@@ -138,7 +138,7 @@ def checked_lens(values: Mapping[str, Any], where: str) -> Lens:
 
 def _checked_distortion(values: Mapping[str, Any], where: str) -> Distortion | None:
     """Return the distortion of a lens, None for a pinhole; `SceneError` if it is not supported."""
-    other = [key for key in _OTHER_PROJECTIONS if values.get(key)]
+    other = [key for key in _OTHER_PROJECTIONS if values.get(key, False) is not False]
     if other:
         raise SceneError(
             f"{where} has {other[0]}, a projection that is not supported; render pinhole images"

@@ -29,9 +29,9 @@ Y_UP_FORMATS = frozenset({".glb", ".gltf"})
 Y_UP_LINE = "# y is up"
 """First line of OBJ files whose y axis is up, as in ours; the format itself defines no axes."""
 
-_PACKED = frozenset(
-    {"KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_mesh_quantization"}
-)
+_HARMLESS_EXTENSIONS = ("KHR_materials_", "KHR_texture_", "EXT_texture_", "KHR_lights_", "KHR_xmp")
+"""Beginnings of the names of glTF extensions that do not change the shape."""
+
 # A face thinner than this share of the bounding box's diagonal has no usable normal or chart.
 _DEGENERATE_HEIGHT = 1e-7
 # Texels between charts in the packer's own atlas. It comes out larger than asked for, so 1.6 texels
@@ -82,8 +82,8 @@ def read_mesh(
     Raises
     ------
     ValueError
-        If the file cannot be read, holds no triangle or faces of vertices that do not exist, or is
-        an OBJ with faces that are not convex, which would be cut into triangles that overlap.
+        If the file cannot be read, holds no triangle, faces of vertices that do not exist, or faces
+        that are not convex (OBJ and PLY), which would be cut into triangles that overlap.
     """
     _require_plain(Path(path))
     _require_convex(Path(path))
@@ -103,6 +103,7 @@ def read_mesh(
     if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
         raise ValueError(f"{path} must hold a triangle mesh, found no triangle in it")
     vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int32)
+    _refuse_concave(Path(path), vertices, _ply_polygons(mesh))
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise ValueError(f"{path} has faces of vertices that it does not have")
     return vertices, faces
@@ -112,15 +113,19 @@ def _source(path: Path) -> dict[str, Any]:
     """Return the arguments that trimesh reads a file by.
 
     In an OBJ, a negative index counts back from the vertices above its line, but trimesh counts
-    from the end of the file; such indices are replaced by those from the start.
+    from the end of the file; such indices are replaced by those from the start. Names that are not
+    UTF-8 would keep it from reading the file; they are of no importance here.
     """
     if path.suffix.lower() != ".obj" or not path.is_file():
         return {"file_obj": path}
     text = path.read_bytes().replace(b"\\\n", b" ")
+    plain_text = text.decode("utf-8", errors="replace").encode()
     if not re.search(rb"^f\s.*[\s/]-\d", text, re.MULTILINE):
-        return {"file_obj": path}
+        if plain_text == text:
+            return {"file_obj": path}
+        return {"file_obj": BytesIO(plain_text), "file_type": "obj"}
     counts, lines = {b"v": 0, b"vt": 0, b"vn": 0}, []
-    for line in text.splitlines():
+    for line in plain_text.splitlines():
         keyword, *corners = line.partition(b"#")[0].split() or [b""]
         if keyword in counts:
             counts[keyword] += 1
@@ -181,11 +186,16 @@ def _require_plain(path: Path) -> None:
     """Refuse glTF whose numbers are packed in a way that is not read, or is read wrongly."""
     if path.suffix.lower() not in Y_UP_FORMATS or not path.is_file():
         return
-    packed = sorted(_PACKED & set(_gltf_tree(path).get("extensionsRequired", [])))
-    if packed:
+    tree = _gltf_tree(path)
+    required = tree.get("extensionsRequired") or []
+    unread = sorted(name for name in required if not name.startswith(_HARMLESS_EXTENSIONS))
+    # Sparse accessors replace single values of another accessor.
+    if any("sparse" in accessor for accessor in tree.get("accessors") or []):
+        unread.append("sparse accessors")
+    if unread:
         raise ValueError(
-            f"{path} is compressed ({', '.join(packed)}), which is not read; export it without "
-            "compression"
+            f"{path} needs {', '.join(unread)}, which is not read; export it without compression "
+            "or other extensions"
         )
 
 
@@ -213,8 +223,39 @@ def _require_convex(path: Path) -> None:
         return
     try:
         positions = np.array([line.split()[1:4] for line in points], np.float64)
-        concave_count = sum(_count_folded(positions[np.array(rows)]) for rows in polygons.values())
-    except (ValueError, IndexError):
+    except ValueError:
+        return
+    _refuse_concave(path, positions, {size: np.array(rows) for size, rows in polygons.items()})
+
+
+def _ply_polygons(mesh: trimesh.Trimesh) -> dict[int, Int[np.ndarray, "N C"]]:
+    """Return the faces of a PLY file with more than three corners, by their number of corners."""
+    faces = mesh.metadata.get("_ply_raw", {}).get("face", {}).get("data")
+    if faces is None:
+        return {}
+    names = faces.dtype.names if isinstance(faces, np.ndarray) else faces
+    name = next((name for name in ("vertex_indices", "vertex_index") if name in names), None)
+    if name is None:
+        return {}
+    corners = faces[name]
+    if corners.dtype.names:  # of a binary file: numbers of corners, and the corners
+        corners = corners[corners.dtype.names[-1]]
+    sizes = np.array([len(rows) for rows in corners])
+    return {
+        int(size): np.array([corners[k] for k in np.flatnonzero(sizes == size)])
+        for size in np.unique(sizes[sizes > 3])
+    }
+
+
+def _refuse_concave(
+    path: Path,
+    positions: Float[np.ndarray, "V 3"],
+    polygons: Mapping[int, Int[np.ndarray, "N C"]],
+) -> None:
+    """Refuse faces that are not convex; those of missing vertices are left to other checks."""
+    try:
+        concave_count = sum(_count_folded(positions[rows]) for rows in polygons.values())
+    except IndexError:
         return
     if concave_count:
         raise ValueError(

@@ -60,13 +60,15 @@ def _add_mesh(stage: Any, mesh: trimesh.Trimesh) -> Any:
     return shape
 
 
-def _add_material(stage: Any, textures: Mapping[str, str]) -> Any:
+def _add_material(stage: Any, textures: Mapping[str, str], has_specular: bool) -> Any:
     """Define the material with a reader for each texture."""
     gf, sdf, usd_shade = _modules("Gf", "Sdf", "UsdShade")
     kinds = sdf.ValueTypeNames
     material = usd_shade.Material.Define(stage, "/Object/Material")
     surface = usd_shade.Shader.Define(stage, "/Object/Material/Surface")
     surface.CreateIdAttr("UsdPreviewSurface")
+    if not has_specular:
+        surface.CreateInput("ior", kinds.Float).Set(1.0)
     coordinates = usd_shade.Shader.Define(stage, "/Object/Material/Coordinates")
     coordinates.CreateIdAttr("UsdPrimvarReader_float2")
     coordinates.CreateInput("varname", kinds.String).Set(_COORDINATES)
@@ -94,7 +96,13 @@ def _add_material(stage: Any, textures: Mapping[str, str]) -> Any:
     return material
 
 
-def write_usd(path: str | Path, mesh: trimesh.Trimesh, textures: Mapping[str, str]) -> None:
+def write_usd(
+    path: str | Path,
+    mesh: trimesh.Trimesh,
+    textures: Mapping[str, str],
+    *,
+    has_specular: bool = True,
+) -> None:
     """Write a textured mesh as USD, with y up and metres as units.
 
     Parameters
@@ -103,6 +111,8 @@ def write_usd(path: str | Path, mesh: trimesh.Trimesh, textures: Mapping[str, st
     mesh : mesh with texture coordinates, ``v`` upwards.
     textures : names of files in the same folder, by ``base_color`` (sRGB), ``roughness`` and
         ``metallic`` (grey), and ``normal``.
+    has_specular : False gives the material a refractive index of 1, at which dielectrics reflect
+        nothing head-on; white at a grazing angle is part of the format.
 
     Raises
     ------
@@ -115,7 +125,7 @@ def write_usd(path: str | Path, mesh: trimesh.Trimesh, textures: Mapping[str, st
     usd_geom.SetStageMetersPerUnit(stage, 1.0)
     stage.SetDefaultPrim(usd_geom.Xform.Define(stage, "/Object").GetPrim())
     shape = _add_mesh(stage, mesh)
-    material = _add_material(stage, textures)
+    material = _add_material(stage, textures, has_specular)
     usd_shade.MaterialBindingAPI.Apply(shape.GetPrim()).Bind(material)
     with written_aside(path) as temporary_path:
         stage.GetRootLayer().Export(str(temporary_path))

@@ -45,10 +45,15 @@ class MaterialSampler:
     ----------
     trained : parameters of a run.
     asset : surface and splats of the same run.
+
+    Attributes
+    ----------
+    has_specular : whether the material has a specular lobe.
     """
 
     def __init__(self, trained: Trained, asset: Asset) -> None:
         self._spec = replace(trained.pipeline.fields, position_gradient=False)
+        self.has_specular = self._spec.specular != "none"
         self._field = trained.params.material
         self._box = trained.pipeline.surface.box
         self._nearest: KDTree | None = None
@@ -136,12 +141,14 @@ def export_assets(
     asset = build_asset(trained.pipeline, trained.params)
     tell("surface and splats", 1, 1)
     tell("mesh and textures", 0, 1)
+    sampler = MaterialSampler(trained, asset)
     mesh_info = export_mesh_glb(
         folder / "mesh.glb",
         vertices,
         faces,
         normals,
-        MaterialSampler(trained, asset),
+        sampler,
+        has_specular=sampler.has_specular,
         vertex_colors=vertex_colors,
         texture_size=texture_size,
         obj_path=folder / "mesh.obj" if obj else None,
@@ -213,7 +220,13 @@ def write_model(
         (model_folder / "mesh.glb").unlink(missing_ok=True)
         return None
     info = export_mesh_glb(
-        model_folder / "mesh.glb", vertices, faces, normals, sampler, texture_size=texture_size
+        model_folder / "mesh.glb",
+        vertices,
+        faces,
+        normals,
+        sampler,
+        has_specular=sampler.has_specular,
+        texture_size=texture_size,
     )
     files = {}
     for number, (title, radiance) in enumerate(lights.items()):

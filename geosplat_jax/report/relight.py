@@ -32,6 +32,9 @@ SMALLEST_MOVIE = 384
 
 BACKGROUNDS = ("light", "white", "black")
 
+_LARGEST_RINGING = 1e-3
+"""Largest share of the light that negative values may sum up to."""
+
 _lookup = jax.jit(lookup)
 _rotate_light = jax.jit(rotate_light)
 _SUBSAMPLES = 4
@@ -42,17 +45,18 @@ def load_light(path: str | Path, *, largest: int = LARGEST_LIGHT) -> EnvLight:
     """Read a lat-long environment map: linear radiance from HDR or EXR, sRGB from other images.
 
     The layout is that of `EnvLight`: z up, ``u = 0.5 - atan2(y, x) / (2 pi)``. Maps with more than
-    ``largest`` rows are reduced by averaging over solid angle. A black one causes a warning.
+    ``largest`` rows are reduced by averaging over solid angle. A black one causes a warning. So do
+    negative values that sum up to less than a thousandth of the light; they are set to zero.
 
     Raises
     ------
     SceneError
-        If the file cannot be read, is not twice as wide as high, or holds negative or infinite
-        radiance.
+        If the file cannot be read, is not twice as wide as high, or holds radiance that is negative
+        or not finite.
     """
-    stored_pixels = read_stored(path)
     # A light has no alpha: a fourth channel is ignored.
-    pixels = linear_values(np.ascontiguousarray(stored_pixels[..., :3]), Path(path))
+    stored_pixels = np.ascontiguousarray(read_stored(path)[..., :3])
+    pixels = linear_values(_without_ringing(stored_pixels, path), Path(path))
     if pixels.ndim != 3 or pixels.shape[-1] < 3 or pixels.shape[1] != 2 * pixels.shape[0]:
         raise SceneError(
             f"{path} has shape {pixels.shape}; an environment map is twice as wide as high and has "
@@ -66,6 +70,22 @@ def load_light(path: str | Path, *, largest: int = LARGEST_LIGHT) -> EnvLight:
     if radiance.shape[0] > largest:
         radiance = resize_light(radiance, largest, 2 * largest)
     return EnvLight(jnp.asarray(radiance, jnp.float32))
+
+
+def _without_ringing(pixels: np.ndarray, path: str | Path) -> np.ndarray:
+    """Set negative values to zero, with a warning, if they are a small share of the light.
+
+    Filters that resize a map overshoot beside a sun; a map of Synthetic4Relight has such values.
+    """
+    lost = -float(np.minimum(pixels, 0).sum(dtype=np.float64))
+    if not 0 < lost < _LARGEST_RINGING * float(np.maximum(pixels, 0).sum(dtype=np.float64)):
+        return pixels
+    warnings.warn(
+        f"{int((pixels < 0).sum())} values of {path} are negative and are set to zero",
+        RuntimeWarning,
+        stacklevel=3,
+    )
+    return np.maximum(pixels, 0)
 
 
 def load_view_light(light: ViewLight, *, largest: int = LARGEST_LIGHT) -> EnvLight:

@@ -169,7 +169,15 @@ class Painter:
         sampler = MaterialSampler(self.trained, self._found.asset())
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "mesh.glb"
-            export_mesh_glb(path, vertices, faces, normals, sampler, vertex_colors=True)
+            export_mesh_glb(
+                path,
+                vertices,
+                faces,
+                normals,
+                sampler,
+                has_specular=sampler.has_specular,
+                vertex_colors=True,
+            )
             return path.read_bytes()
 
     def gaussians(self) -> Gaussians:

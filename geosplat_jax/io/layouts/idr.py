@@ -14,14 +14,13 @@ import numpy as np
 from scipy.linalg import rq
 
 from geosplat_jax.io.frames import (
-    MASK_FOLDERS,
     Frame,
     Listing,
-    beside_images,
     captured_frame,
     checked_numbers,
     images_in,
     opengl_pose,
+    paired_masks,
     require_no_light,
     split_capture,
 )
@@ -62,45 +61,13 @@ def list_idr(root: Path, *, light: str | None = None) -> Listing:
             f"{where} has {count} cameras, but {images[0].parent} has {len(images)} images; they "
             "belong together by number and name"
         )
-    masks = _masks(root, images)
+    masks = paired_masks(root, images)
     return split_capture(
         [
             _frame(root, image, number, matrices, where, mask)
             for number, (image, mask) in enumerate(zip(images, masks, strict=True))
         ]
     )
-
-
-def _masks(root: Path, images: list[Path]) -> list[Path | None]:
-    """Pair masks with images in the order of their numbers if no mask is named after its image.
-
-    Scenes of DTU have ``image/000000.png`` beside ``mask/000.png``. If masks are named after their
-    images, or there are none, all results are None: `captured_frame` finds masks by name.
-
-    Raises
-    ------
-    SceneError : there are not as many masks as images.
-    """
-    folder = next((root / name for name in MASK_FOLDERS if (root / name).is_dir()), None)
-    if folder is None or any(beside_images(root, image, MASK_FOLDERS) for image in images):
-        return [None] * len(images)
-    files = images_in(root, (folder.name,))
-    if len(files) != len(images):
-        raise SceneError(
-            f"{folder} has {len(files)} masks for {len(images)} images, and none is named after "
-            "its image; they belong together by number"
-        )
-    masks: list[Path | None] = [None] * len(images)
-    by_number = sorted(range(len(images)), key=lambda k: _number(images[k]))
-    for k, file in zip(by_number, sorted(files, key=_number), strict=True):
-        masks[k] = file
-    return masks
-
-
-def _number(path: Path) -> tuple[int, str]:
-    """Return the last number in a file's name, to sort by, and the name."""
-    digits = re.findall(r"\d+", path.stem)
-    return (int(digits[-1]) if digits else -1, path.stem)
 
 
 _DAMAGES = (OSError, ValueError, EOFError, KeyError, TypeError, RuntimeError)

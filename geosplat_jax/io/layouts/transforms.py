@@ -1,9 +1,11 @@
-"""nerfstudio, instant-ngp and nvdiffrec: one ``transforms.json`` for all photographs.
+"""nerfstudio and instant-ngp: one ``transforms.json`` for all photographs.
 
 Poses are camera-to-world with OpenGL axes. The lens is given once for all frames or in each frame
 (`frames.list_transforms`). ``mask_path`` names the object's mask, white on the object; without it,
 the mask is looked for in ``masks/`` (`frames.beside_images`). instant-ngp excludes pixels by a file
-``dynamic_mask_NAME.png`` beside an image: pixels that are not black in it do not count.
+``dynamic_mask_NAME.png`` beside an image: pixels that are not black in it do not count. Blurred
+photographs that were sorted out stay listed: where the first frame has a ``sharpness``, frames
+without an image are left out.
 
 nerfstudio gives the split by ``train_filenames``, ``val_filenames`` and ``test_filenames``. Test
 views are those of ``test_filenames`` or, if there are none, of ``val_filenames``.
@@ -32,7 +34,7 @@ from geosplat_jax.io.frames import (
     require_no_light,
     split_capture,
 )
-from geosplat_jax.io.images import SceneError
+from geosplat_jax.io.images import MissingFileError, SceneError
 
 FILE = "transforms.json"
 
@@ -49,6 +51,7 @@ def list_transforms_capture(root: Path, *, light: str | None = None) -> Listing:
 
     Raises
     ------
+    MissingFileError : a frame has no image or mask; see above for images that may be missing.
     SceneError : see `frames.list_transforms`; two frames have one name; the split names a file
         that no frame has, uses a view both for training and for testing, or leaves no view to
         train on; a light is asked for.
@@ -60,16 +63,29 @@ def list_transforms_capture(root: Path, *, light: str | None = None) -> Listing:
         rows = content["applied_transform"]
         shape = (4, 4) if isinstance(rows, list) and len(rows) == 4 else (3, 4)
         checked_numbers(rows, shape, f"'applied_transform' of {where}")
+    listed_frames = list_transforms(content, where)
     frames: dict[str, Frame] = {}
-    for listed_frame in list_transforms(content, where):
+    missing_count = 0
+    for listed_frame in listed_frames:
         name = _plain(listed_frame.file_path)
         if name in frames:
             raise SceneError(f"{where} names {name!r} for two frames; remove one")
-        frames[name] = _frame(root, listed_frame, where)
+        try:
+            image = _image(root, listed_frame, where)
+        except MissingFileError:
+            if "sharpness" not in listed_frames[0].values:
+                raise
+            missing_count += 1
+            continue
+        frames[name] = _frame(root, listed_frame, image, where)
+    if not frames:
+        raise MissingFileError(f"{root} has none of the images that {where.name} names; add them")
+    note = f"{missing_count} frames of {where.name} have no image, as instant-ngp leaves them out"
+    notes = (note,) if missing_count else ()
     splits = {key: _names(content, key, where, frames) for key in _SPLITS if key in content}
     if not splits:
-        return split_capture(list(frames.values()))
-    return _given_split(frames, splits, where)
+        return split_capture(list(frames.values()), notes=notes)
+    return _given_split(frames, splits, where, notes)
 
 
 def _plain(path: str) -> str:
@@ -77,7 +93,8 @@ def _plain(path: str) -> str:
     return str(PurePosixPath(path.replace("\\", "/")))
 
 
-def _frame(root: Path, listed_frame: ListedFrame, where: Path) -> Frame:
+def _image(root: Path, listed_frame: ListedFrame, where: Path) -> Path:
+    """Return the photograph of a frame; `MissingFileError` if there is none."""
     listed_path = inside_scene(root, listed_frame.file_path, where)
     stem = image_stem(root, listed_frame.file_path, where)
     candidates = [listed_path]
@@ -86,7 +103,10 @@ def _frame(root: Path, listed_frame: ListedFrame, where: Path) -> Frame:
             *(stem.with_name(stem.name + suffix) for suffix in IMAGE_SUFFIXES),
             listed_path,
         ]
-    image = existing(root, candidates, f"{listed_frame.file_path} of {where.name}")
+    return existing(root, candidates, f"{listed_frame.file_path} of {where.name}")
+
+
+def _frame(root: Path, listed_frame: ListedFrame, image: Path, where: Path) -> Frame:
     mask, name = None, listed_frame.values.get("mask_path")
     if name is not None:
         if not isinstance(name, str) or not name:
@@ -115,7 +135,10 @@ def _names(
 
 
 def _given_split(
-    frames: Mapping[str, Frame], splits: Mapping[str, Sequence[str]], where: Path
+    frames: Mapping[str, Frame],
+    splits: Mapping[str, Sequence[str]],
+    where: Path,
+    notes: tuple[str, ...],
 ) -> Listing:
     train_key, validation_key, test_key = _SPLITS
     test = splits.get(test_key) or splits.get(validation_key) or []
@@ -130,10 +153,10 @@ def _given_split(
     if not train:
         raise SceneError(f"the split of {where} leaves no view to train on")
     unused_count = len(frames) - len(set(train) | set(test))
-    notes = (f"{unused_count} views that the split of {where.name} leaves out are not used",)
+    note = f"{unused_count} views that the split of {where.name} leaves out are not used"
     return Listing(
         train=tuple(frames[name] for name in train),
         test=tuple(frames[name] for name in test),
         is_capture=True,
-        notes=notes if unused_count else (),
+        notes=(*notes, note) if unused_count else notes,
     )
