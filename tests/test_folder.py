@@ -11,7 +11,7 @@ import pytest
 from support import sphere_dataset, tiny_config
 
 from geosplat_jax.fit.config import Budget
-from geosplat_jax.fit.folder import RunError, RunFolder
+from geosplat_jax.fit.folder import CAMERAS, RunError, RunFolder
 from geosplat_jax.fit.planning import TrainingError
 from geosplat_jax.fit.trained import load_trained
 from geosplat_jax.io.checkpoints import save_checkpoint
@@ -214,6 +214,18 @@ def test_what_was_planned_stays_known_when_settings_are_amended(run):
         run.amend(tiny_config(f"stages.split_sum.steps={steps}"))
         assert run.config().stages[0].steps == steps
         assert run.planned() == initial_config
+
+
+def test_the_record_keeps_the_path_of_cameras_that_it_was_given(run, monkeypatch):
+    path = run.path / "run.json"
+    record = json.loads(path.read_text())
+    record["dataset"]["cameras"] = "/scene/cameras.json"
+    path.write_text(json.dumps(record))
+    (run.path / CAMERAS).write_text("{}")
+    monkeypatch.chdir(run.path.parent)
+    assert RunFolder(run.path.name).record()["dataset"]["cameras"] == f"{run.path.name}/{CAMERAS}"
+    RunFolder(run.path.name).amend(tiny_config("stages.split_sum.steps=7"))
+    assert json.loads(path.read_text())["dataset"]["cameras"] == "/scene/cameras.json"
 
 
 def test_what_other_commands_left_in_the_folder_is_in_nobodys_way(run, dataset):

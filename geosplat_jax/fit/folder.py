@@ -211,6 +211,13 @@ class RunFolder:
         RunError
             If there is no run, or ``run.json`` is damaged.
         """
+        record, cameras = self._record(), self.path / CAMERAS
+        if record["dataset"].get("cameras") is not None and cameras.exists():
+            record["dataset"]["cameras"] = str(cameras)
+        return record
+
+    def _record(self) -> dict[str, Any]:
+        """Read ``run.json`` as it was written; see `record`."""
         if not self.exists:
             raise RunError(f"{self.path} is not a run (it has no run.json)")
         record = _parsed(self._record_path)
@@ -226,9 +233,6 @@ class RunFolder:
             from_plain(_Scene, {"scene": record["scene"]})
         except ValueError as error:
             raise RunError(f"{self._record_path} is damaged: {first_line(error)}") from None
-        cameras = self.path / CAMERAS
-        if record["dataset"].get("cameras") is not None and cameras.exists():
-            record["dataset"]["cameras"] = str(cameras)
         return record
 
     def config(self) -> Config:
@@ -418,7 +422,7 @@ class RunFolder:
 
     def amend(self, config: Config) -> None:
         """Record settings that have changed during the training; see `planned`."""
-        record = self.record()
+        record = self._record()
         planned_values = record.get("planned", record["config"])
         self._write_record({**record, "planned": planned_values, "config": config.to_dict()})
 
@@ -489,7 +493,7 @@ class RunFolder:
             lines = [line for line in all_lines if line["step"] < step]
             if len(lines) < len(all_lines) and self.exists:
                 self._write_record(
-                    {**self.record(), "seconds_lost": used_seconds - _seconds(lines)}
+                    {**self._record(), "seconds_lost": used_seconds - _seconds(lines)}
                 )
             text = "".join(json.dumps(line) + "\n" for line in lines)
             with written_aside(self.metrics) as temporary_path:
