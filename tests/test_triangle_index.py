@@ -215,6 +215,36 @@ def test_cells_are_neither_none_nor_too_many(stretch, edges):
         assert np.prod(shape) > 2**18
 
 
+def plane(side):
+    """Vertices and faces of the square [-1, 1]^2 at z = 0, ``side`` quads along each side."""
+    x, y = np.meshgrid(*2 * [np.linspace(-1, 1, side + 1)])
+    rows = np.arange((side + 1) ** 2).reshape(side + 1, side + 1)
+    a, b, c, d = rows[:-1, :-1], rows[:-1, 1:], rows[1:, 1:], rows[1:, :-1]
+    halves = [np.stack([part.ravel() for part in half], 1) for half in ((a, b, c), (a, c, d))]
+    return np.stack([x, y, 0 * x], -1).reshape(-1, 3), np.concatenate(halves)
+
+
+def test_a_flat_start_leaves_room_for_a_relief():
+    vertices, faces = plane(30)
+    shape = cells_for(vertices, faces)
+    relief = 0.3 * np.cos(3 * vertices[:, 0]) * np.cos(3 * vertices[:, 1])
+    vertices[:, 2] = relief
+    index = index_of(vertices, faces, is_sheet=True, shape=shape)
+    assert not overflowed(index.usage, AMPLE)
+    assert float(index.grid.cell_size) < 2 * (2 / 30)  # a quad is 2 / 30 wide
+    assert int(index.usage["cell_triangles"]) < 40
+    # Where there is no room the cells stay as they are.
+    assert cells_for(np.array([500.0, 500.0, 1.0]) * plane(4)[0], plane(4)[1])[2] >= 3
+
+
+def test_places_are_as_large_as_cells():
+    """Reservoirs of a point that has moved further are discarded."""
+    vertices, faces = plane(10)
+    index = index_of(vertices, faces, is_sheet=True, shape=cells_for(vertices, faces))
+    assert float(index.place_size) == float(index.grid.cell_size)
+    assert 0.1 < float(index.place_size) < 0.6
+
+
 @pytest.mark.slow
 def test_agrees_with_embree_on_a_hundred_thousand_rays():
     pytest.importorskip("embreex", reason="no Embree for this platform")

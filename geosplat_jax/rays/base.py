@@ -27,7 +27,10 @@ class RayIndex(eqx.Module):
 
     @property
     def place_size(self) -> Float[Array, ""]:
-        """Size of a place in world units; infinite where places are faces. See `places`."""
+        """How far a point may move and still be at its place, in world units; see `places`.
+
+        Infinite unless an index says otherwise.
+        """
         return jnp.asarray(jnp.inf)
 
     def places(self, positions: Float[Array, "N 3"], faces: Int[Array, " N"]) -> Int[Array, " N"]:

@@ -74,11 +74,6 @@ class GridIndex(CellIndex):
         """Bits of a word that count patches."""
         return _COUNT_BITS
 
-    @property
-    def place_size(self) -> Float[Array, ""]:
-        """Edge length of a cell, world units."""
-        return self.grid.cell_size
-
     def places(self, positions: Float[Array, "N 3"], faces: Int[Array, " N"]) -> Int[Array, " N"]:
         """Return the cell of each point, because rows of faces change with the topology."""
         del faces

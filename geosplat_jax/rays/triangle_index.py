@@ -32,6 +32,10 @@ time in tracing than they would cost in building the index."""
 _MOST_CELLS = 1 << 20
 """Most cells of a grid, about; their words take 4 MB."""
 
+_ROOMS = (1 / 4, 1 / 8, 1 / 16, 1 / 32)
+"""Least numbers of cells along the shortest axes, as shares of that along the longest; the first
+that leaves no more than `_MOST_CELLS` is taken."""
+
 _MOST_BOXES = 1 << 25
 """Most pairs of a triangle and a cell that its bounding box meets; so many take some gigabytes."""
 
@@ -54,7 +58,9 @@ def cells_for(
 
     Returns
     -------
-    (nx, ny, nz), together about 2**20 cells at most, margins included.
+    (nx, ny, nz), together about 2**20 cells at most, margins included. If there is room, the
+    shortest axes have a quarter as many cells as the longest: the numbers are static, and a start
+    that is flat may become a relief.
     """
     corners = np.asarray(vertices, np.float64)[faces]
     edges = corners - np.roll(corners, 1, axis=1)
@@ -64,6 +70,11 @@ def cells_for(
     counts = np.ceil(extent / cell)
     while np.prod(counts + 2 * _MARGIN) > _MOST_CELLS:
         counts = np.maximum(np.floor(0.9 * counts), 1)
+    for share in _ROOMS:
+        roomy_counts = np.maximum(counts, np.ceil(share * counts.max()))
+        if np.prod(roomy_counts + 2 * _MARGIN) <= _MOST_CELLS:
+            counts = roomy_counts
+            break
     nx, ny, nz = (int(max(n, 1) + 2 * _MARGIN) for n in counts)
     return nx, ny, nz
 

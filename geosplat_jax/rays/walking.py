@@ -98,6 +98,11 @@ class CellIndex(RayIndex):
     def test(self, lanes: Lanes, *, two_sided: bool, any_hit: bool) -> Lanes:
         """Test the rays against the next entries of their cells."""
 
+    @property
+    def place_size(self) -> Float[Array, ""]:
+        """Edge length of a cell, world units."""
+        return self.grid.cell_size
+
     def count(self, word: Int[Array, " n"]) -> Int[Array, " n"]:
         """Read how many entries a cell lists."""
         return word & ((1 << self.count_bits) - 1)
