@@ -6,6 +6,7 @@ import shutil
 import struct
 import subprocess
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -322,6 +323,32 @@ def test_a_usd_is_the_mesh_of_the_glb_and_its_material_reads_the_textures(tmp_pa
         np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / file)), pixels)
     with pytest.raises(ValueError, match="a USD has textures"):
         export.export_mesh_glb(path, *sphere(1), materials, vertex_colors=True, usd_path=path)
+
+
+@pytest.mark.parametrize("has_specular", [True, False])
+def test_a_lambertian_has_no_specular_lobe_in_any_program(tmp_path, has_specular):
+    paths = {"obj_path": tmp_path / "mesh.obj"}
+    if find_spec("pxr") is not None:
+        paths["usd_path"] = tmp_path / "mesh.usdc"
+    settings = {"texture_size": TEXTURE, "has_specular": has_specular}
+    export.export_mesh_glb(tmp_path / "mesh.glb", *sphere(), materials, **settings, **paths)
+    extension = b'"KHR_materials_specular":{"specularFactor":0.0}'
+    assert (extension in (tmp_path / "mesh.glb").read_bytes()) is not has_specular
+    assert ("Ks 0 0 0" in (tmp_path / "mesh.mtl").read_text()) is not has_specular
+    if "usd_path" in paths:
+        from pxr import Usd, UsdShade
+
+        stage = Usd.Stage.Open(str(paths["usd_path"]))
+        surface = UsdShade.Shader(stage.GetPrimAtPath("/Object/Material/Surface"))
+        assert (surface.GetInput("ior").Get() == 1.0) is not has_specular
+    export.export_mesh_glb(
+        tmp_path / "colours.glb",
+        *sphere(),
+        materials,
+        vertex_colors=True,
+        has_specular=has_specular,
+    )
+    assert (extension in (tmp_path / "colours.glb").read_bytes()) is not has_specular
 
 
 def test_an_open_mesh_is_seen_from_both_sides_in_usd_as_in_gltf(tmp_path):
