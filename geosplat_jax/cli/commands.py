@@ -97,9 +97,8 @@ def _poses(arguments: argparse.Namespace) -> None:
         "time: " + ", ".join(f"{part} {seconds:.0f} s" for part, seconds in report.seconds.items())
     )
     print(f"model: {report.model}")
-    print(
-        f"next: masks of the object (docs/captures.md), then geosplat-jax train {arguments.folder}"
-    )
+    next_command = shlex.join(["geosplat-jax", "train", str(arguments.folder)])
+    print(f"next: masks of the object (docs/captures.md), then {next_command}")
 
 
 def _masks(arguments: argparse.Namespace) -> None:
