@@ -64,7 +64,7 @@ def test_every_setting_is_written_as_it_is_set(preset):
     )
     assert written["stages.monte_carlo.enter"].startswith("[{kind = ")
     assert written["stages.monte_carlo.transport.denoise.depth_sigma"] == "inf"
-    # A stage has its name from its place; kinds and names of presets are not single settings.
+    # The name of a stage cannot be set.
     overrides = [f"{path}={text}" for path, text in rows if not path.endswith(".name")]
     assert make_config(preset, overrides=tuple(overrides)) == config
 

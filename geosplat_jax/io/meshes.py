@@ -240,6 +240,8 @@ def _ply_polygons(mesh: trimesh.Trimesh) -> dict[int, Int[np.ndarray, "N C"]]:
     corners = faces[name]
     if corners.dtype.names:  # of a binary file: numbers of corners, and the corners
         corners = corners[corners.dtype.names[-1]]
+    if corners.dtype != object:  # all faces have as many corners
+        return {corners.shape[1]: corners} if corners.shape[1] > 3 else {}
     sizes = np.array([len(rows) for rows in corners])
     return {
         int(size): np.array([corners[k] for k in np.flatnonzero(sizes == size)])

@@ -80,7 +80,7 @@ def list_transforms_capture(root: Path, *, light: str | None = None) -> Listing:
         frames[name] = _frame(root, listed_frame, image, where)
     if not frames:
         raise MissingFileError(f"{root} has none of the images that {where.name} names; add them")
-    note = f"{missing_count} frames of {where.name} have no image, as instant-ngp leaves them out"
+    note = f"{missing_count} frames of {where.name} have no image and are left out"
     notes = (note,) if missing_count else ()
     splits = {key: _names(content, key, where, frames) for key in _SPLITS if key in content}
     if not splits:
