@@ -137,7 +137,8 @@ def refined_cameras(
     if geometry is not None:
         geometry.notes(dataset)
     provenance = {
-        "reading": options,
+        # The views' fingerprints hold the cameras, so a file of cameras may lie elsewhere now.
+        "reading": {key: options[key] for key in options if not key.startswith("cameras")},
         "views": [dataset.train.fingerprint(), dataset.test.fingerprint()],
         "masks": [np.round(views.coverage, 6).tolist() for views in (dataset.train, dataset.test)],
         "colours": [views.mean_colors.tolist() for views in (dataset.train, dataset.test)],

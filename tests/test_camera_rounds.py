@@ -93,6 +93,13 @@ def test_the_digest_of_given_cameras_is_not_that_of_the_next(made, tmp_path):
     assert made[1][0] == {"cameras": rounds_folder(tmp_path / "fox") / "round_1.json"}
 
 
+def test_rounds_go_on_after_the_given_cameras_have_moved(made, tmp_path):
+    for place in ("given.json", "moved.json"):
+        reading = {"cameras": tmp_path / place, "cameras_digest": "abc"}
+        refined_cameras("scene", tmp_path / "fox", rounds=1, reading=reading)
+    assert len(made) == 1
+
+
 def test_rounds_are_beside_the_run_wherever_that_is(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert rounds_folder(".") == tmp_path.with_name(f"{tmp_path.name}_cameras")

@@ -586,6 +586,26 @@ def test_a_vertical_angle_gives_the_vertical_focal_length(blender):
     assert intrinsics[1, 1] == pytest.approx(0.5 * SIZE / np.tan(0.2))
 
 
+def test_angles_may_be_given_in_degrees(blender):
+    with_lens(blender, {"x_fov": 40.0, "y_fov": 20.0, "w": SIZE, "h": SIZE})
+    intrinsics = load(blender).train.intrinsics[0]
+    expected_focals = 0.5 * SIZE / np.tan(np.radians([20.0, 10.0]))
+    np.testing.assert_allclose(np.diag(intrinsics)[:2], expected_focals)
+
+
+@pytest.mark.parametrize("angle", [0.0, 180.0, "40", None])
+def test_impossible_angles_in_degrees_are_refused(blender, angle):
+    with_lens(blender, {"x_fov": angle, "w": SIZE, "h": SIZE})
+    with pytest.raises(SceneError, match=r"'x_fov' of frame 0 of .* must be in \(0, 180\) degrees"):
+        load(blender)
+
+
+def test_an_angle_in_two_units_is_refused(blender):
+    edit(blender, lambda content: content.update(x_fov=40.0))
+    with pytest.raises(SceneError, match="both 'x_fov' and 'camera_angle_x'; remove one"):
+        load(blender)
+
+
 def test_an_angle_gives_the_focal_length_that_a_lens_lacks(blender):
     edit(blender, lambda content: content.update(cx=9.0, w=SIZE, h=SIZE))
     focal = 0.5 * SIZE / np.tan(0.5 * ANGLE)

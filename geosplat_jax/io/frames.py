@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from geosplat_jax.io.documents import parse_json
 from geosplat_jax.io.images import MissingFileError, SceneError
-from geosplat_jax.io.lenses import Lens, checked_lens
+from geosplat_jax.io.lenses import Lens, checked_lens, with_angles_in_radians
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".exr", ".tif", ".tiff")
 MAP_SUFFIXES = (".hdr", ".exr")
@@ -156,11 +156,12 @@ def read_transforms(path: Path) -> list[tuple[str, np.ndarray, Lens]]:
 def list_transforms(content: Mapping[str, Any], path: Path) -> list[ListedFrame]:
     """Check the frames of a ``transforms*.json``.
 
-    A lens is given by ``camera_angle_x``, or by ``fl_x, fl_y, cx, cy`` in pixels of an image of
-    ``w`` by ``h``, once for all frames or in each frame. A missing ``fl_x`` is computed from the
-    angle, a missing ``fl_y`` from ``camera_angle_y``, or else it equals ``fl_x``; a missing ``cx``
-    or ``cy`` is the middle of the image. ``camera_model``, ``is_fisheye``, ``k1`` to ``k4``, ``p1``
-    and ``p2``, or ``distortion_params``, describe the distortion.
+    A lens is given by ``camera_angle_x`` (radians) or ``x_fov`` (degrees), or by ``fl_x, fl_y, cx,
+    cy`` in pixels of an image of ``w`` by ``h``, once for all frames or in each frame. A missing
+    ``fl_x`` is computed from the angle, a missing ``fl_y`` from ``camera_angle_y`` or ``y_fov``, or
+    else it equals ``fl_x``; a missing ``cx`` or ``cy`` is the middle of the image.
+    ``camera_model``, ``is_fisheye``, ``k1`` to ``k4``, ``p1`` and ``p2``, or
+    ``distortion_params``, describe the distortion.
 
     Parameters
     ----------
@@ -182,7 +183,7 @@ def list_transforms(content: Mapping[str, Any], path: Path) -> list[ListedFrame]
         file_path = require(frame, "file_path", where)
         if not isinstance(file_path, str) or not file_path:
             raise SceneError(f"'file_path' of {where} must be a name, got {file_path!r}")
-        merged_values = {**content, **frame}
+        merged_values = with_angles_in_radians({**content, **frame}, where)
         if "fl_x" not in merged_values and "camera_angle_x" not in merged_values:
             require(content, "camera_angle_x", path)
         pose = checked_pose(require(frame, "transform_matrix", where), where)

@@ -84,6 +84,27 @@ def _matrix(fx: float, fy: float, cx: float, cy: float) -> Float[np.ndarray, "3 
     return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
 
+def with_angles_in_radians(values: Mapping[str, Any], where: str) -> dict[str, Any]:
+    """Replace instant-ngp's ``x_fov`` and ``y_fov``, degrees, by ``camera_angle_x`` and ``_y``.
+
+    Raises
+    ------
+    SceneError : an angle is not between 0 and 180 degrees, or is given in radians, too.
+    """
+    converted_values = dict(values)
+    for axis in ("x", "y"):
+        key, radians_key = f"{axis}_fov", f"camera_angle_{axis}"
+        if key not in values:
+            continue
+        angle = values[key]
+        if radians_key in values:
+            raise SceneError(f"{where} has both {key!r} and {radians_key!r}; remove one")
+        if not _is_number(angle) or not 0.0 < angle < 180.0:
+            raise SceneError(f"{key!r} of {where} must be in (0, 180) degrees, got {angle!r}")
+        converted_values[radians_key] = math.radians(angle)
+    return converted_values
+
+
 def checked_lens(values: Mapping[str, Any], where: str) -> Lens:
     """Return the lens that the keys of a ``transforms.json`` describe.
 
