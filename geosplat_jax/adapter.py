@@ -29,16 +29,16 @@ class AdapterConstants:
     """Constants of the sampling; static and hashable."""
 
     u: Number = 0.07
-    """Barycentric coordinate of the outer triple of points, in [0, 1/3)."""
+    """Outer points have the barycentric coordinates (u, u, 1 - 2u) in any order; in [0, 1/3)."""
     v: Number = 0.22
-    """Barycentric coordinate of the inner triple of points, in [0, 1/3)."""
+    """Inner points have the barycentric coordinates (v, v, 1 - 2v) in any order; in [0, 1/3)."""
     alpha: tuple[Positive, Positive] = (0.80, 2.08)
     """(outer, inner) ratio of S_x to half the length of the sampled segment."""
     beta: tuple[Positive, Positive] = (15.0, 13.0)
     """(outer, inner) divisor of S_y."""
     thickness: Positive = 4.54e-5
-    """S_z in half the longest side of the scene's box (the paper's box is [-1, 1]^3). The paper
-    prints 4.5e-7; the authors' code has exp(-10), which is this."""
+    """S_z in half extents of the scene's box (the paper's box is [-1, 1]^3). The paper prints
+    4.5e-7; the authors' code has exp(-10), which is this."""
     opacity: PositiveShare = 0.99
     """Opacity of every splat."""
     shading_frame: bool = False
@@ -60,33 +60,36 @@ PAPER = AdapterConstants(opacity=1.0, shading_frame=True)
 CODE = AdapterConstants(u=1 / 9 - 1 / 24, v=2 / 9)
 
 
-def _inert(splats: Splats) -> Splats:
-    """Overwrite the rows past the count with harmless values."""
+def with_inert_padding(splats: Splats) -> Splats:
+    """Overwrite the rows past the count with harmless values; they get no gradient."""
     is_real = splats.mask
     dtype = splats.means.dtype
     unit_quat = jnp.array([[1.0, 0.0, 0.0, 0.0]], dtype)
-    means = jnp.where(is_real[:, None], splats.means, 0.0)
     return replace(
         splats,
-        means=means,
+        means=jnp.where(is_real[:, None], splats.means, 0.0),
         quats=jnp.where(is_real[:, None], splats.quats, unit_quat),
         scales=jnp.where(is_real[:, None], splats.scales, 1.0),
         opacities=jnp.where(is_real, splats.opacities, 0.0),
         normals=jnp.where(is_real[:, None], splats.normals, 0.0),
-        anchors=means,
+        anchors=jnp.where(is_real[:, None], splats.anchors, 0.0),
     )
 
 
 def _blend(
-    corners: Float[Array, "3 3 F"], corner: float
+    corners: Float[Array, "3 3 F"], opposite: float
 ) -> tuple[Float[Array, "3 F"], Float[Array, "3 F"], Float[Array, "3 F"]]:
-    """Blend corner values at the midpoints m12, m23, m31 of the triple with ``corner``."""
+    """Blend corner values at the midpoints m12, m23, m31 of a triple of barycentric points.
+
+    The paper's points b1, b2, b3 lie nearest to P3, P2, P1. The midpoint m12 is opposite to P1: it
+    has the weight ``opposite`` on P1 and equal weights on P2 and P3.
+    """
     p1, p2, p3 = corners
-    side = 0.5 * (1.0 - corner)
+    side = 0.5 * (1.0 - opposite)
     return (
-        corner * p1 + side * (p2 + p3),
-        corner * p3 + side * (p1 + p2),
-        corner * p2 + side * (p1 + p3),
+        opposite * p1 + side * (p2 + p3),
+        opposite * p3 + side * (p1 + p2),
+        opposite * p2 + side * (p1 + p3),
     )
 
 
@@ -118,23 +121,24 @@ def face_splats(
     values = jnp.concatenate([mesh.vertices, normals], axis=1)[mesh.faces.T].transpose(0, 2, 1)
     corners, corner_normals = values[:, :3], values[:, 3:]
     face_normal, area = (x.T for x in face_normals_and_areas(mesh))
-    # The segments of both rings are parallel to the same three edges: P2-P3, P1-P2, P3-P1.
+    # The segments of both rings are parallel to the same three edges: P2-P3, P1-P2, P3-P1, in the
+    # order of the midpoints m12, m23, m31.
     p1, p2, p3 = corners
     edges = (p2 - p3, p1 - p2, p3 - p1)
     lengths = [safe_norm(edge, axis=0) for edge in edges]
 
     means, shading_normals, scales = [], [], []
-    for ring, corner in enumerate((constants.u, constants.v)):
-        means += _blend(corners, corner)
-        ring_normals = [safe_normalize(n, axis=0) for n in _blend(corner_normals, corner)]
+    for ring, opposite in enumerate((constants.u, constants.v)):
+        means += _blend(corners, opposite)
+        ring_normals = [safe_normalize(n, axis=0) for n in _blend(corner_normals, opposite)]
         shading_normals += ring_normals
         for length in lengths:
-            segment = (1.0 - 3.0 * corner) * length
+            segment = (1.0 - 3.0 * opposite) * length
             scale_x = 0.5 * constants.alpha[ring] * segment  # Eq. 10
-            scale_y = safe_divide(2.0 * area, constants.beta[ring] * segment)
+            scale_y = safe_divide(2.0 * area, constants.beta[ring] * segment)  # Eq. 10
             thickness = jnp.full_like(scale_x, constants.thickness * unit)
             scales.append(jnp.stack([scale_x, scale_y, thickness]))
-    if constants.shading_frame:
+    if constants.shading_frame:  # Eq. 10, R_x R_y R_z
         quats = [_frame(edge, n) for edge, n in zip(edges * 2, shading_normals, strict=True)]
     else:
         quats = [_frame(edge, face_normal) for edge in edges] * 2
@@ -162,7 +166,7 @@ def face_splats(
         parents=jnp.repeat(faces, SPLATS_PER_FACE),
         count=mesh.face_count * SPLATS_PER_FACE,
     )
-    return _inert(splats)
+    return with_inert_padding(splats)
 
 
 def _frame(along: Float[Array, "3 F"], up: Float[Array, "3 F"]) -> Float[Array, "4 F"]:
@@ -202,6 +206,7 @@ def vertex_splats(
     face_normal, area = face_normals_and_areas(mesh)
     corner_normals = normals[mesh.faces]
     cosines = jnp.sum(face_normal[:, None, :] * corner_normals, axis=-1)
+    # A third of each face's area as seen along the vertex normal (Eq. 12).
     share = jnp.where(mesh.face_mask[:, None], 2.0 * area[:, None] * cosines / 6.0, 0.0)
     zero = jnp.zeros((mesh.vertices.shape[0],), mesh.vertices.dtype)
     star_area = zero.at[mesh.faces.reshape(-1)].add(share.reshape(-1))
@@ -219,7 +224,7 @@ def vertex_splats(
         parents=jnp.full(radius.shape, -1, jnp.int32),
         count=mesh.vertex_count,
     )
-    return _inert(splats)
+    return with_inert_padding(splats)
 
 
 def shift_inwards(splats: Splats, mesh: Mesh, fraction: Float[Array, " N"]) -> Splats:
@@ -324,7 +329,7 @@ class DiscSplats(FaceSplats):
         scales = jnp.stack([radius, radius, splats.scales[:, 2]], axis=-1)
         tangent, bitangent = frame_from_normal(splats.outward)
         quats = matrix_to_quaternion(jnp.stack([tangent, bitangent, splats.outward], axis=-1))
-        return _inert(replace(splats, scales=scales, quats=quats))
+        return with_inert_padding(replace(splats, scales=scales, quats=quats))
 
 
 @settings

@@ -40,7 +40,7 @@ class PerPixel(ShadingDomain, kind="per_pixel"):
     """Where rays start: at the blended positions of the splats (the paper), or where the mesh is
     first hit (the authors' code). Pixels whose ray misses the mesh take the blended position."""
     ray_offset: NonNegative = 1e-3
-    """How far above its point a ray starts, in half the longest side of the box. Rays from the
+    """How far above its point a ray starts, in half extents of the box. Rays from the
     mesh start on their face, which they never hit, and need no offset."""
     detach_coverage: bool = True
     """Attributes and colours take the coverage as a constant, as in the authors' code: opacities
@@ -79,6 +79,7 @@ class PerPixel(ShadingDomain, kind="per_pixel"):
         height, width = alpha.shape
         coverage = jax.lax.stop_gradient(alpha) if self.detach_coverage else alpha
         share = jnp.maximum(coverage, _THINNEST).reshape(-1, 1)
+        # Eq. 21: blended attributes over coverage.
         straight_values = {n: x.reshape(height * width, -1) / share for n, x in images.items()}
         materials = replace(
             asset.attributes.materials,
@@ -87,7 +88,7 @@ class PerPixel(ShadingDomain, kind="per_pixel"):
             metallic=straight_values["metallic"][:, 0],
         )
         points = self._points(pipeline, asset, straight_values, alpha.reshape(-1) > 0, camera)
-        shaded = self.adapted(pipeline.transport).shade(
+        shaded = self.adapted(pipeline.transport).shade(  # Eq. 22
             key,
             points,
             Attributes(materials, None, straight_values.get("indirect")),

@@ -252,19 +252,21 @@ def _corner_values(
 
 def _dual_vertices(geometry: Geometry, lattice: Lattice, cells: _Cells, *, capacity: int) -> _Duals:
     """Place one vertex for every patch of the surface in a cell."""
-    row_number = jnp.arange(capacity, dtype=jnp.int32)
-    row = jnp.searchsorted(cells.first_vertex, row_number, side="right").astype(jnp.int32) - 1
-    is_real = row_number < cells.vertex_count
-    slot = row_number - cells.first_vertex[row]
-    patch = _rows(jnp.asarray(PATCH_EDGES.astype(np.int32).reshape(-1)), cells.case[row] * 4 + slot)
+    dual = jnp.arange(capacity, dtype=jnp.int32)
+    # A dual vertex belongs to the last listed cell whose first vertex is not after it.
+    rank = jnp.searchsorted(cells.first_vertex, dual, side="right").astype(jnp.int32) - 1
+    is_real = dual < cells.vertex_count
+    slot = dual - cells.first_vertex[rank]
+    patch_edges = jnp.asarray(PATCH_EDGES.astype(np.int32).reshape(-1))
+    patch = _rows(patch_edges, cells.case[rank] * 4 + slot)
     is_crossed = (patch[None, :] >> jnp.arange(12, dtype=jnp.int32)[:, None]) & 1 == 1
     is_crossed = is_crossed & is_real[None, :]
-    index, cell_size = cells.row[row], lattice.grid.cell_size
+    row, cell_size = cells.row[rank], lattice.grid.cell_size
 
-    sdf, corners = _corner_values(geometry, lattice, index, cells.coordinates[:, row])
-    alpha = jnp.tanh(_rows(geometry.alpha, index).T) * _WEIGHT_SCALE + 1.0
-    beta = jnp.tanh(_rows(geometry.beta, index).T) * _WEIGHT_SCALE + 1.0
-    gamma = jax.nn.sigmoid(_rows(geometry.gamma, index))
+    sdf, corners = _corner_values(geometry, lattice, row, cells.coordinates[:, rank])
+    alpha = jnp.tanh(_rows(geometry.alpha, row).T) * _WEIGHT_SCALE + 1.0
+    beta = jnp.tanh(_rows(geometry.beta, row).T) * _WEIGHT_SCALE + 1.0
+    gamma = jax.nn.sigmoid(_rows(geometry.gamma, row))
     gamma = gamma * _WEIGHT_SCALE + 0.5 * (1.0 - _WEIGHT_SCALE)
 
     start, end = _edge_ends(corners)
@@ -284,7 +286,7 @@ def _dual_vertices(geometry: Geometry, lattice: Lattice, cells: _Cells, *, capac
     return _Duals(
         points=points * cell_size,
         gamma=gamma,
-        cells=jnp.where(is_real, cells.number[row], 0),
+        cells=jnp.where(is_real, cells.number[rank], 0),
         deviations=deviations * cell_size,
         crosses=is_crossed,
     )
@@ -312,12 +314,12 @@ def _quads(lattice: Lattice, cells: _Cells, *, capacity: int) -> _Quads:
     """Join the dual vertices of the four cells around every crossed interior edge."""
     is_owned = _owned_crossings(cells.signs, cells.coordinates)
     owner = bit_set(is_owned.reshape(-1)).first(capacity=capacity)
-    row, axis = owner // 3, owner % 3
+    rank, axis = owner // 3, owner % 3
     is_real = jnp.arange(capacity, dtype=jnp.int32) < cells.quad_count
 
     nx, ny, nz = lattice.grid.shape
     steps = QUAD_CELLS @ np.array([1, nx, nx * ny], np.int32)
-    number = cells.number[row][None, :] + _rows(jnp.asarray(steps), axis).T
+    number = cells.number[rank][None, :] + _rows(jnp.asarray(steps), axis).T
     cell_ranks = cells.bits.rank(lattice.rows_of_cells(jnp.clip(number, 0, nx * ny * nz - 1)))
     edge = _rows(jnp.asarray(QUAD_EDGES), axis).T
     patch_of_edge = jnp.asarray(PATCH_OF_EDGE.astype(np.int32).reshape(-1))
@@ -325,7 +327,7 @@ def _quads(lattice: Lattice, cells: _Cells, *, capacity: int) -> _Quads:
     corners = _rows(cells.first_vertex, cell_ranks) + slot
 
     # The surface faces the positive side: along the axis if its lower end is inside.
-    is_inside = cells.signs[row] & 1 == 1
+    is_inside = cells.signs[rank] & 1 == 1
     corners = jnp.where(is_inside[None, :], corners, corners[np.array([0, 3, 2, 1])])
     # The original code compares diagonals in an order that depends on the sign of the first end of
     # an edge, and lists edges along y from their upper end. This matters for equal weights only.
@@ -502,7 +504,7 @@ class GridSurface(SurfaceModel):
         """Evaluate the penalties of the isosurface by name.
 
         ``entropy`` is Eq. 14, see `sdf_entropy`; ``deviation`` is L_dev of FlexiCubes, in units of
-        half the box's side; ``weights`` is `weight_magnitude`.
+        half extents of the box; ``weights`` is `weight_magnitude`.
         """
         lattice = self.lattice
         return {

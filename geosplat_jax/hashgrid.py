@@ -59,7 +59,7 @@ class HashGridSpec:
     features: Annotated[int, Field(ge=1, le=64)] = 4
     """Numbers that a vertex of a grid holds."""
     log2_entries: Annotated[int, Field(ge=1, le=30)] = 15
-    """Base-2 logarithm of the rows of the largest table."""
+    """Base-2 logarithm of the most rows that a level may have."""
     coarsest: PositiveCount = 16
     """Cells along an axis of the first level."""
     finest: PositiveCount = 512

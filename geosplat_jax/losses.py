@@ -72,7 +72,7 @@ class Objective:
     smoothness_samples: PositiveCount = 4096
     """Splats on which Eq. 15-17 are estimated in one step."""
     smoothness_radius: NonNegative = SMOOTHNESS_STD
-    """Standard deviation of the displacement of Eq. 16, in half the side of the box."""
+    """Standard deviation of the displacement of Eq. 16, in half extents of the box."""
     radiometric_samples: PositiveCount = 1024
     """Splats, each with a direction, at which learned and sampled radiance are compared in one
     step."""
@@ -144,7 +144,7 @@ class ViewInputs:
         background = random_background(
             self.key, self.rgb.shape, self.rgb.dtype, objective.background
         )
-        return compare(
+        return over_background(
             self.rgb,
             self.output.alpha,
             self.view.image,
@@ -178,7 +178,10 @@ class SharedInputs:
 
     @cached_property
     def changes(self) -> Changes:
-        """Eq. 15-17 on a random subset of the splats: unbiased, at a fraction of the cost."""
+        """Eq. 15-17 on a random subset of the splats, at a fraction of the cost.
+
+        See `smoothness` for its bias.
+        """
         splats, objective = self.asset.splats, self.objective
         choice_key, displacement_key = jax.random.split(self.key)
         uniforms = jax.random.uniform(choice_key, (objective.smoothness_samples,), jnp.float32)
@@ -212,7 +215,7 @@ def random_background(
     return jnp.broadcast_to(colors, shape)
 
 
-def compare(
+def over_background(
     rgb: Float[Array, "V H W 3"],
     alpha: Float[Array, "V H W"],
     image: Float[Array, "V H W 4"],
@@ -272,7 +275,7 @@ def image_dissimilarity(images: ImagePair) -> Float[Array, ""]:
         return 1.0 - jnp.mean(jax.vmap(ssim)(predicted, target))
     # Values of pixels that do not count must not reach the sums, not even as a NaN.
     predicted, target = (jnp.where(valid[..., None] > 0, x, 0.0) for x in (predicted, target))
-    similarities = jax.vmap(lambda a, b, counts: ssim(a, b, valid=counts))(predicted, target, valid)
+    similarities = jax.vmap(lambda a, b, valid: ssim(a, b, valid=valid))(predicted, target, valid)
     return 1.0 - jnp.mean(similarities)
 
 
@@ -281,7 +284,7 @@ def mask_error(images: ImagePair) -> Float[Array, ""]:
     return _mean((images.alpha - images.mask) ** 2, images.valid)
 
 
-def light_agreement(
+def light_error(
     diffuse: Float[Array, "V H W 3"],
     specular_radiance: Float[Array, "V H W 3"],
     log_exposure: Float[Array, ""],
@@ -445,7 +448,7 @@ VIEW_TERMS: dict[str, Callable[[ViewInputs], Float[Array, ""]]] = {
     "mask": lambda x: mask_error(x.pair),
     "encoded_l1": lambda x: image_l1(x.pair.encoded()),
     "encoded_ssim": lambda x: image_dissimilarity(x.pair.encoded()),
-    "light": lambda x: light_agreement(  # Eq. 18
+    "light": lambda x: light_error(  # Eq. 18
         x.output.aovs["diffuse"],
         x.output.aovs["specular_radiance"],
         x.log_exposure,
@@ -462,7 +465,8 @@ VIEW_TERMS: dict[str, Callable[[ViewInputs], Float[Array, ""]]] = {
         relative=x.objective.relative_albedo,
     ),
 }
-"""Terms of a single view by the name of their weight; the loss takes their mean over the views."""
+"""Terms of a single view by the name of their weight; the loss takes their mean over the views,
+weighted by `Batch.shares`."""
 
 PIXEL_MEANS = frozenset({"l1", "ssim", "mask", "encoded_l1", "encoded_ssim", "light"})
 """Terms of a view that are means over all pixels that count, so that empty borders make them
@@ -476,7 +480,7 @@ SHARED_TERMS: dict[str, Callable[[SharedInputs], Float[Array, ""]]] = {
     "metallic_mixture": lambda x: metallic_mixture(
         x.asset.attributes.materials.metallic, x.asset.splats.mask
     ),
-    "radiometric": lambda x: radiometric_disagreement(x),
+    "radiometric": radiometric_disagreement,
     "white_balance": lambda x: white_balance(x.params.light.radiance),
     "light_tint": lambda x: light_tint(x.params.light.radiance),
     "light_cast": lambda x: light_cast(x.params.light.radiance),

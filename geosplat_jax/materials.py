@@ -31,7 +31,7 @@ ROUGHNESS_MINIMUM = 0.1
 handful of light samples cannot resolve."""
 
 SMOOTHNESS_STD = 0.01
-"""Standard deviation of the displacement in Eq. 16, in half the longest side of the box."""
+"""Standard deviation of the displacement in Eq. 16, in half extents of the box."""
 
 MATERIAL_PRIORS: dict[str, tuple[float, float]] = {
     "outdoor": (0.0, 0.0),
@@ -295,7 +295,9 @@ def smoothness(
 
     Eq. 15 evaluates the attributes at a point, Eq. 16 at ``mu + N(0, std^2)``, and Eq. 17 sums the
     absolute differences, whose three parts are returned apart. They are averaged over the points of
-    the mask; zero when there are none. Any random subset of the splats gives an unbiased estimate.
+    the mask; zero when there are none. With ``relative = 0`` any random subset of the splats gives
+    an unbiased estimate; otherwise the part of the albedo is a quotient of two sample means, whose
+    bias falls as one over the number of points.
 
     Parameters
     ----------
@@ -303,7 +305,7 @@ def smoothness(
     points : (M, 3) world.
     mask : (M,) false for padding.
     key : random key of the displacements.
-    std : standard deviation of a displacement along each axis, in units of half the box's side.
+    std : standard deviation of a displacement along each axis, in half extents of the box.
     relative : the change of the albedo is divided by twice the mean of the albedo over both sets of
         points, raised to this power, channel by channel: 0 gives Eq. 17; with 1 a darker albedo
         does not count as smoother.

@@ -5,8 +5,9 @@ splats, transport and terms are meant. Nothing is threaded beside it::
 
     (total, report), gradient = jax.value_and_grad(pipeline.loss, has_aux=True)(params, batch)
 
-The loss is a mean over views of `Pipeline.view_loss`, plus `Pipeline.shared_loss`. Training makes
-the same gradient from these parts, see `fit.gradient`.
+The loss is a mean over views of `Pipeline.view_loss`, weighted by each view's share of the pixels
+that count (`Batch.shares`), plus `Pipeline.shared_loss`. Training makes the same gradient from
+these parts, see `fit.gradient`.
 """
 
 from dataclasses import replace
@@ -70,7 +71,8 @@ class LossReport(eqx.Module):
     Attributes
     ----------
     terms : unweighted value of every term that has a weight.
-    psnr : () decibels of the composited training images, tone mapped, linear.
+    psnr : () decibels of the training images over their backgrounds; linear, exposed and softly
+        clipped at one (`core.color.tone_map`).
     splat_count, face_count : () int32.
     usage : true needs of every buffer.
     carry : what the transport keeps for the next step.
@@ -100,8 +102,9 @@ class Pipeline(RenderPipeline):
     def loss(self, params: Params, batch: Batch) -> tuple[Float[Array, ""], LossReport]:
         """Evaluate Eq. 19 on a batch of views; differentiate in ``params`` with ``has_aux=True``.
 
-        With a transport that draws samples, these are constants, and the gradient is not that of
-        the returned, noisy value; see `residual_image`.
+        Samples are constants. Where the transport draws a second set of them
+        (`Transport.for_residual`), the value comes from the second image and the gradient is not
+        its derivative; see `residual_image`.
 
         Returns
         -------
@@ -246,8 +249,16 @@ class Pipeline(RenderPipeline):
         """
         key = jax.random.fold_in(batch.key, _SHARED_STREAM)
         transport = self.domain.adapted(self.transport)
-        parts = (self.surface, self.fields, self.objective)
-        inputs = SharedInputs(params, asset, *parts, key, transport, lights)
+        inputs = SharedInputs(
+            params=params,
+            asset=asset,
+            surface=self.surface,
+            fields=self.fields,
+            objective=self.objective,
+            key=key,
+            transport=transport,
+            lights=lights,
+        )
         terms = shared_terms(inputs, self.weights)
         return self._weighted(terms), terms
 

@@ -10,7 +10,7 @@ gives the albedo no gradient. The face that a splat belongs to is a constant.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import equinox as eqx
@@ -23,11 +23,12 @@ from geosplat_jax.adapter import (
     AdapterConstants,
     SplatModel,
     SplatSettings,
+    with_inert_padding,
 )
 from geosplat_jax.core.mesh import closest_on_faces, face_normals_and_areas
 from geosplat_jax.core.numerics import safe_log, safe_normalize
 from geosplat_jax.core.settings import Share, settings
-from geosplat_jax.core.types import Box, Splats, learned
+from geosplat_jax.core.types import RATE_GROUP, Box, Splats, learned
 from geosplat_jax.materials import Attributes
 from geosplat_jax.surface.base import Surface
 
@@ -42,13 +43,18 @@ _OFF_THE_EDGE = 0.01
 """Share by which faces are shrunk about their centres, so that rays start off their edges."""
 
 
+INDIRECT_GROUP = "splat_indirect"
+"""Learning rate of indirect light, which splats hold only where their transport learns it."""
+
+
 class FreeSplatParameters(eqx.Module):
     """What N splats have learned; rows past those of the mesh's faces are padding.
 
     Attributes
     ----------
-    means : (N, 3) in half sides of the box, from its centre.
-    log_scales : (N, 3) natural logarithms of the standard deviations, in half sides of the box.
+    means : (N, 3) from the centre of the box, in its half extents.
+    log_scales : (N, 3) natural logarithms of the standard deviations, in half extents of the
+        box.
     quats : (N, 4) (w, x, y, z), of any length.
     normals : (N, 3) shading normals, of any length.
     opacity_logits : (N,).
@@ -63,20 +69,11 @@ class FreeSplatParameters(eqx.Module):
     normals: Float[Array, "N 3"] = learned("splat_normals")
     opacity_logits: Float[Array, " N"] = learned("splat_opacities")
     albedo: Float[Array, "N 3"] = learned("splat_albedo")
-    indirect: Float[Array, "N c"] | None = learned("splat_indirect")
+    indirect: Float[Array, "N c"] | None = learned(INDIRECT_GROUP)
 
 
-INDIRECT_GROUP = "splat_indirect"
-"""Learning rate of indirect light, which splats hold only where their transport learns it."""
-
-RATE_GROUPS = (
-    "splat_means",
-    "splat_scales",
-    "splat_quats",
-    "splat_normals",
-    "splat_opacities",
-    "splat_albedo",
-    INDIRECT_GROUP,
+RATE_GROUPS: tuple[str, ...] = tuple(
+    field.metadata[RATE_GROUP] for field in fields(FreeSplatParameters)
 )
 """Learning rates of `FreeSplatParameters`, field by field."""
 
@@ -155,22 +152,18 @@ class FreeSplats(SplatModel):
         outward = normals.at[parents].get(mode="clip")
         means = box.center[None, :] + box.half_extent * parameters.means
         anchors = closest_on_faces(mesh, parents, means, margin=_OFF_THE_EDGE)
-        is_real = jnp.arange(count, dtype=jnp.int32) < mesh.face_count * SPLATS_PER_FACE
-        means = jnp.where(is_real[:, None], means, 0.0)
-        unit_quat = jnp.array([[1.0, 0.0, 0.0, 0.0]], means.dtype)
-        return Splats(
+        splats = Splats(
             means=means,
-            quats=jnp.where(is_real[:, None], safe_normalize(parameters.quats), unit_quat),
-            scales=jnp.where(
-                is_real[:, None], box.half_extent * jnp.exp(parameters.log_scales), 1.0
-            ),
-            opacities=jnp.where(is_real, jax.nn.sigmoid(parameters.opacity_logits), 0.0),
-            normals=jnp.where(is_real[:, None], safe_normalize(parameters.normals), 0.0),
+            quats=safe_normalize(parameters.quats),
+            scales=box.half_extent * jnp.exp(parameters.log_scales),
+            opacities=jax.nn.sigmoid(parameters.opacity_logits),
+            normals=safe_normalize(parameters.normals),
             outward=outward,
-            anchors=jnp.where(is_real[:, None], anchors, 0.0),
+            anchors=anchors,
             parents=parents,
             count=mesh.face_count * SPLATS_PER_FACE,
         )
+        return with_inert_padding(splats)
 
     def dress(self, attributes: Attributes, parameters: FreeSplatParameters) -> Attributes:
         """Give every splat its own albedo, and its indirect light where any is learned.

@@ -1,4 +1,4 @@
-"""The composition: parameters and cameras in, images out; the only module that sees every stage.
+"""The composition: parameters and cameras in, images out; the only module that sees every part.
 
 A `RenderPipeline` names the parts: a surface, splats on it, fields of attributes, a transport of
 light and the domain in which it is evaluated. `RenderPipeline.reconstruct` runs what depends on
@@ -88,7 +88,7 @@ class RasterSettings:
     tile_size: Annotated[int, Field(ge=1, le=256)] = DEFAULT_TILE_SIZE
     """Edge of the square tiles in pixels."""
     near: Positive = 0.01
-    """Near plane, in half the longest side of the box around the object."""
+    """Near plane, in half extents of the box around the object."""
 
     def eligible(self, splats: Splats, camera: Camera) -> Bool[Array, " N"]:
         """Tell which splats are real and, with ``cull_backfaces``, face a single-view camera, (N,).

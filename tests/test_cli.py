@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from support import MONTE_CARLO, TINY
+from support import MONTE_CARLO, TINY, sphere_dataset, tiny_config
 
 from geosplat_jax.cli import main, training
 from geosplat_jax.cli.arguments import command_line
@@ -155,7 +155,7 @@ def test_export_writes_assets_that_load(run, tmp_path, style, capsys):
     assert "16 x 8 lat-long" in output_text
     mesh = trimesh.load(tmp_path / "mesh.glb", force="mesh")
     assert len(mesh.faces) > 50
-    assert f"faces {len(mesh.faces)}," in output_text
+    assert f" {len(mesh.faces)} faces," in output_text
     header = (tmp_path / "gaussians.ply").read_bytes()[:400].decode("ascii", "replace")
     assert header.startswith("ply")
     assert "f_dc_0" in header
@@ -206,6 +206,14 @@ def test_resuming_checks_the_scene_and_the_configuration(run, scene, capsys):
         capsys.readouterr().err
     )
     assert len((run / "metrics.jsonl").read_text().splitlines()) == 4
+
+
+def test_a_folder_that_holds_a_run_is_refused_before_the_scene_is_read(tmp_path, capsys):
+    run_folder = RunFolder(tmp_path / "run")
+    with run_folder.locked():
+        run_folder.begin(sphere_dataset(), tiny_config(), replace=False)
+    assert main(["train", str(tmp_path / "no_scene"), "--output", str(run_folder.path)]) == 2
+    assert "holds a run; continue it with --resume" in capsys.readouterr().err
 
 
 @pytest.mark.slow

@@ -910,6 +910,19 @@ def test_bounds_are_checked(blender):
             load(blender, bounds=bounds)
 
 
+def test_bounds_that_cut_the_object_are_told(blender):
+    lo, hi = load_dataset(blender).bounds
+    middle, half = 0.5 * (lo + hi), 0.5 * (hi - lo)
+
+    def cuts(size):
+        warnings = load(blender, bounds=(middle - size * half, middle + size * half)).warnings
+        return [text for text in warnings if "outside the given bounds" in text]
+
+    assert not cuts(1.0)
+    (text,) = cuts(0.7)
+    assert "open there" in text
+
+
 def test_cameras_that_look_past_each_other_say_so(blender):
     def change(content):
         for frame in content["frames"]:

@@ -143,8 +143,9 @@ def test_the_stage_of_the_page_trains_the_albedo_alone(examples):
     stage = examples["polished"].active_stages[-1]
     assert stage.name == "polish"
     require_rates(examples["polished"])
-    assert "albedo" not in stage.frozen
-    assert {"sdf", "light", "roughness_metallic"} <= set(stage.frozen)
+    assert "splat_albedo" not in stage.frozen
+    assert {"sdf", "light", "roughness_metallic", "splat_means"} <= set(stage.frozen)
+    assert stage.splats == examples["polished"].active_stages[-2].splats
 
 
 def test_docstrings_of_the_site_are_lists():

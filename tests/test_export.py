@@ -463,6 +463,13 @@ def test_a_map_of_normals_gives_a_mesh_of_few_faces_the_look_of_the_fine_one(tmp
     assert set(np.unique(tangents[:, 3])) <= {-1.0, 1.0}
 
 
+def test_a_mesh_of_few_faces_is_kept_as_it_is_and_gets_no_map_of_normals(tmp_path):
+    path = tmp_path / "mesh.glb"
+    info = export.export_mesh_glb(path, *sphere(1), materials, texture_size=64, face_count=80)
+    assert (info["faces"], info["reduced"]) == (80, False)
+    assert "normalTexture" not in glb_tree(path)["materials"][0]
+
+
 def test_a_hole_that_fewer_faces_tear_is_said_and_gives_the_mesh_two_sides(tmp_path, monkeypatch):
     def torn(vertices, faces, count):
         return vertices, faces[:count]

@@ -10,7 +10,7 @@ from support import double_precision
 from geosplat_jax.core.types import EnvLight
 from geosplat_jax.transport.environment import lookup, texel_solid_angles
 from geosplat_jax.transport.light_sampling import (
-    _drawn,
+    _invert_cdf,
     light_density,
     light_sampler,
     sample_light,
@@ -48,7 +48,7 @@ def test_the_density_integrates_to_one(name):
     sampler = light_sampler(LIGHTS[name])
     total = jnp.sum(sampler.density * texel_solid_angles(*sampler.density.shape))
     assert float(total) == pytest.approx(1.0, abs=1e-5)
-    for table in (sampler.rows, sampler.columns):
+    for table in (sampler.row_cdf, sampler.column_cdf):
         np.testing.assert_allclose(table[:, -1], 1.0, rtol=1e-6)
         assert bool(jnp.all(jnp.diff(table, axis=1) >= 0))
 
@@ -125,7 +125,7 @@ def test_every_texel_of_a_large_map_can_be_drawn():
     radiance[160, 400] = 3e4
     sampler = jax.jit(light_sampler)(EnvLight(jnp.asarray(radiance)))
     rows, columns = (
-        np.diff(np.asarray(t, float), prepend=0.0) for t in (sampler.rows, sampler.columns)
+        np.diff(np.asarray(t, float), prepend=0.0) for t in (sampler.row_cdf, sampler.column_cdf)
     )
     assert np.all(columns > 0)
     share = np.asarray(sampler.density) * np.asarray(texel_solid_angles(1024, 2048))
@@ -143,7 +143,7 @@ def test_the_search_finds_the_entry_of_every_number(width):
     tables[:, -1] = 1.0
     numbers = np.concatenate([rng.uniform(0, 1, 50), tables[0, :-1], [0.0]]).astype(np.float32)
     for row in range(3):
-        entries, fractions = _drawn(
+        entries, fractions = _invert_cdf(
             jnp.asarray(tables), jnp.full(len(numbers), row, jnp.int32), jnp.asarray(numbers)
         )
         np.testing.assert_array_equal(entries, np.searchsorted(tables[row], numbers, side="right"))

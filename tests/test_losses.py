@@ -11,17 +11,17 @@ from geosplat_jax.losses import (
     ImagePair,
     Objective,
     ViewInputs,
-    compare,
     edge_aware_smoothness,
     image_dissimilarity,
     image_l1,
-    light_agreement,
     light_cast,
+    light_error,
     light_smoothness,
     light_tint,
     mask_error,
     mean_metallic,
     metallic_mixture,
+    over_background,
     random_background,
     white_balance,
 )
@@ -44,7 +44,7 @@ def uniform(seed, *shape, low=0.0, high=1.0):
 def comparison(valid=None):
     """Two unlike images over a random background."""
     image = uniform(2, *SHAPE, 4)
-    return compare(
+    return over_background(
         0.8 * uniform(1, *SHAPE, 3),
         uniform(3, *SHAPE),
         image,
@@ -57,7 +57,7 @@ def comparison(valid=None):
 def test_identical_images_cost_nothing():
     rgb = uniform(0, *SHAPE, 3)
     image = jnp.concatenate([rgb, jnp.ones((*SHAPE, 1))], axis=-1)
-    images = compare(rgb, jnp.ones(SHAPE), image, uniform(5, *SHAPE, 3), None, srgb=False)
+    images = over_background(rgb, jnp.ones(SHAPE), image, uniform(5, *SHAPE, 3), None, srgb=False)
     np.testing.assert_allclose(terms_of(images), 0.0, atol=ROUNDING)
     assert float(images.mse) == 0.0
 
@@ -68,7 +68,7 @@ def test_the_background_shows_only_where_coverage_differs():
     image = jnp.concatenate([jnp.full((1, 16, 16, 3), 0.3), alpha[..., None]], axis=-1)
     for seed in (0, 1):
         background = uniform(seed, *rgb.shape)
-        images = compare(rgb, alpha, image, background, None, srgb=False)
+        images = over_background(rgb, alpha, image, background, None, srgb=False)
         assert float(image_l1(images)) == pytest.approx(0.0, abs=1e-7)
         np.testing.assert_array_equal(images.predicted[0, 0, 0], background[0, 0, 0])
 
@@ -81,7 +81,7 @@ def test_backgrounds_differ_by_pixel_by_view_or_not_at_all(kind, colours):
 
 def test_encoded_images_are_compared_as_they_are_seen():
     plain, encoded = (
-        compare(
+        over_background(
             uniform(1, *SHAPE, 3, low=0.0, high=0.1),
             jnp.ones(SHAPE),
             jnp.ones((*SHAPE, 4)) * 0.05,
@@ -162,7 +162,7 @@ def one_pixel(colour, mask=1.0):
 
 def test_eq_18_compares_mean_light_with_the_largest_channel():
     diffuse, specular = jnp.full((1, 2, 2, 3), 0.1), jnp.full((1, 2, 2, 3), 0.2)
-    agreement = light_agreement(diffuse, specular, jnp.zeros(()), one_pixel((0.2, 0.6, 0.4)))
+    agreement = light_error(diffuse, specular, jnp.zeros(()), one_pixel((0.2, 0.6, 0.4)))
     assert float(agreement) == pytest.approx(0.3 / 4, rel=1e-5)
 
 
@@ -170,9 +170,9 @@ def test_eq_18_looks_at_exposed_and_tone_mapped_light():
     """Twice the exposure is twice the light, until the tone map clips it."""
     diffuse, black = jnp.full((1, 2, 2, 3), 0.2), jnp.zeros((1, 2, 2, 3))
     image = one_pixel((0.4, 0.4, 0.4))
-    exposed = light_agreement(diffuse, black, jnp.log(2.0), image)
+    exposed = light_error(diffuse, black, jnp.log(2.0), image)
     assert float(exposed) == pytest.approx(0.0, abs=1e-5)
-    blinding = light_agreement(50 * diffuse, black, jnp.zeros(()), one_pixel((1.0, 1.0, 1.0)))
+    blinding = light_error(50 * diffuse, black, jnp.zeros(()), one_pixel((1.0, 1.0, 1.0)))
     clipped = tone_map(jnp.full((1, 3), 10.0), jnp.zeros(()))[0, 0]
     assert float(blinding) == pytest.approx(abs(float(clipped) - 1) / 4, abs=1e-6)
 
@@ -243,7 +243,7 @@ def test_shade_weighs_more_in_encoded_colour():
     black = jnp.zeros((1, 4, 4, 3))
 
     def errors(value):
-        images = compare(
+        images = over_background(
             value + 0.02, jnp.ones((1, 4, 4)), image.at[..., :3].set(value), black, None, srgb=False
         )
         return float(image_l1(images)), float(image_l1(images.encoded()))

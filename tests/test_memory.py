@@ -25,6 +25,7 @@ from geosplat_jax.io.images import SceneError, read_image, write_png
 from geosplat_jax.io.lenses import AngleLens
 from geosplat_jax.io.loading import load_views
 from geosplat_jax.io.memory import Need, memory_of_machine, memory_refusal
+from geosplat_jax.io.windows import around_object
 from geosplat_jax.surface.hull import fit_grid
 from geosplat_jax.transport.environment import LightSpec, operator_bytes, prefilter_operators
 
@@ -206,6 +207,14 @@ def test_what_is_counted_is_what_a_training_makes():
     assert byte_counts["stages.*.batch_views"] == 2 * 12 * 12 * 16
     grid = fit_grid(dataset.bounds, 9)
     assert surface.grid.shape == grid.shape
+
+
+def test_views_of_a_step_are_counted_as_the_windows_that_they_are():
+    dataset, config = sphere_dataset(size=100, radius=0.1), tiny_config()
+    windows, _ = around_object(dataset.train, largest=config.run.window)
+    assert windows.height < 60
+    byte_counts = {need.what: need.byte_count for need in training_needs(config, dataset)}
+    assert byte_counts["stages.*.batch_views"] == windows.images[0].nbytes
 
 
 def test_the_operators_of_the_light_are_counted_as_they_are_made():

@@ -42,7 +42,7 @@ from geosplat_jax.geometry import (
     weight_magnitude,
 )
 from geosplat_jax.hashgrid import apply_mlp, encode
-from geosplat_jax.losses import compare, image_l1, light_agreement
+from geosplat_jax.losses import image_l1, light_error, over_background
 from geosplat_jax.materials import MaterialSpec, init_materials, smoothness, to_unit_cube
 from geosplat_jax.splats.projection import project
 
@@ -368,7 +368,7 @@ def test_pixels_that_agree_stand_on_the_kink_of_l1():
     @jax.jit
     def l1(change):
         moved_rgb = rgb.at[0, 3, 4, 1].add(change)
-        images = compare(moved_rgb, alpha, image, jnp.zeros_like(rgb), None, srgb=False)
+        images = over_background(moved_rgb, alpha, image, jnp.zeros_like(rgb), None, srgb=False)
         return rgb.size * image_l1(images)
 
     assert l1(0.0) == 0
@@ -381,7 +381,7 @@ def test_light_equal_to_the_value_of_the_image_stands_on_a_kink():
 
     def term(change):
         moved_diffuse = diffuse.at[0, 0, 1, 2].add(change)
-        return 12 * light_agreement(moved_diffuse, 0 * diffuse, jnp.asarray(0.0), image)
+        return 12 * light_error(moved_diffuse, 0 * diffuse, jnp.asarray(0.0), image)
 
     assert term(0.0) == 0
     assert jax.grad(term)(0.0) == AT_ZERO_OF_ABS

@@ -21,7 +21,7 @@ from geosplat_jax.core.capacity import Capacities, fits, grow, overflowed
 from geosplat_jax.core.types import Batch, EnvLight
 from geosplat_jax.fit.stages import update_rule
 from geosplat_jax.fit.step import initial_state, train_step
-from geosplat_jax.losses import light_agreement
+from geosplat_jax.losses import light_error
 from geosplat_jax.pipeline import Pipeline, ViewReport
 
 SMALL = (
@@ -247,7 +247,7 @@ def test_eq_18_takes_what_the_specular_lobe_really_adds():
     _, pipeline, params, batch = problem(stage="split_sum")
     (_, report), _ = evaluate(pipeline, params, batch)
     aovs = draw(pipeline, params, batch.camera, aov_names=AOVS).aovs
-    expected = light_agreement(
+    expected = light_error(
         aovs["diffuse"], aovs["specular_radiance"], params.log_exposure, batch.image
     )
     assert float(report.terms["light"]) == pytest.approx(float(expected), rel=1e-5)

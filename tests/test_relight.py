@@ -282,7 +282,7 @@ def test_a_map_that_cannot_be_an_environment_is_refused(tmp_path):
     write_png(tmp_path / "grey.png", np.ones((4, 8, 1), np.float32))
     with pytest.raises(SceneError, match="three channels"):
         load_light(tmp_path / "grey.png")
-    with pytest.raises((SceneError, OSError), match="absent.hdr"):
+    with pytest.raises(SceneError, match=r"^there is no environment map .*absent\.hdr"):
         load_light(tmp_path / "absent.hdr")
     (tmp_path / "broken.hdr").write_bytes(b"no picture")
     with pytest.raises(SceneError, match="broken.hdr"):

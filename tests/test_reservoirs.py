@@ -20,7 +20,12 @@ from geosplat_jax.transport import reservoirs
 from geosplat_jax.transport.environment import LightSpec, light_directions, texel_solid_angles
 from geosplat_jax.transport.light_sampling import light_sampler
 from geosplat_jax.transport.monte_carlo import MonteCarloSettings
-from geosplat_jax.transport.reservoirs import ReservoirSettings, empty_store, kept, resample
+from geosplat_jax.transport.reservoirs import (
+    ReservoirSettings,
+    empty_store,
+    resample,
+    store_reservoirs,
+)
 from geosplat_jax.transport.sampling import OPEN, cast
 
 KINDS, COPIES, COUNT = 4, 3000, 2
@@ -107,7 +112,7 @@ def one_step(key, store, spec):
     samples = resample(key, points, light, sampler, index, store, spec=spec, count=COUNT)
     hits = cast(points, jnp.moveaxis(samples.directions, 1, 0), index).T
     if store is not None:
-        store = kept(store, points, samples, hits, index, spec=spec)
+        store = store_reservoirs(store, points, samples, hits, index, spec=spec)
     radiance = reservoirs.lookup(light.radiance, samples.directions.reshape(-1, 3))[:, 1]
     cosine = jnp.sum(points.normals[:, None] * samples.directions, axis=-1)
     value = radiance.reshape(POINTS, COUNT) * jnp.maximum(cosine, 0.0) * samples.weights
@@ -314,7 +319,7 @@ def test_what_a_place_kept_is_used_only_nearby_and_on_a_surface_of_that_directio
     first_samples = run(jax.random.key(0), points, store)
     np.testing.assert_array_equal(first_samples.confidences, 4.0)
     hits = jnp.full((POINTS, COUNT), OPEN, jnp.int32)
-    store = jax.jit(partial(kept, spec=spec))(store, points, first_samples, hits, index)
+    store = jax.jit(partial(store_reservoirs, spec=spec))(store, points, first_samples, hits, index)
     moved_points = replace(points, positions=points.positions.at[:, 1].add(1.0))
     far_points = replace(points, positions=points.positions.at[:, 1].add(5.0))
     turned_points = replace(points, normals=-points.normals)
@@ -330,7 +335,9 @@ def test_what_a_place_kept_is_used_only_nearby_and_on_a_surface_of_that_directio
         assert set(np.unique(confidences)) <= ({4.0, 6.0} if is_used else {4.0})
     # A step that sees no point leaves the store as it is.
     unseen_points = replace(points, mask=jnp.zeros(POINTS, bool))
-    same_store = jax.jit(partial(kept, spec=spec))(store, unseen_points, first_samples, hits, index)
+    same_store = jax.jit(partial(store_reservoirs, spec=spec))(
+        store, unseen_points, first_samples, hits, index
+    )
     for leaf, other_leaf in zip(jax.tree.leaves(store), jax.tree.leaves(same_store), strict=True):
         np.testing.assert_array_equal(leaf, other_leaf)
 

@@ -33,7 +33,7 @@ SPEC = LightSpec(16, 32, (0.0, 0.3, 0.6, 1.0))
 
 # Compiled once per shape; eager execution compiles every operation by itself.
 prefiltered = jax.jit(prefilter)
-shade = jax.jit(split_sum, static_argnames=("two_sided", "baked_diffuse"))
+shade = jax.jit(split_sum, static_argnames="baked_diffuse")
 
 
 def _unit(count, seed=0):
@@ -221,22 +221,18 @@ def test_split_sum_is_close_to_the_rendering_integral_under_smooth_light(roughne
         np.testing.assert_allclose(shaded.rgb[0], expected, atol=0.01 if n_dot_v == 1 else 0.15)
 
 
-def test_normals_facing_away_are_flipped_only_when_two_sided():
+def test_normals_facing_away_are_flipped():
     count = 50
     materials, normals, views = _materials(count), _unit(count, 6), _unit(count, 7)
     normals = np.where(np.sum(normals * views, axis=1, keepdims=True) < 0, -normals, normals)
     light = prefiltered(_light(8), prefilter_operators(SPEC))
 
-    def run(normals, **settings):
+    def run(normals):
         normals = jnp.asarray(normals, jnp.float32)
         view_directions = jnp.asarray(views, jnp.float32)
-        return shade(materials, normals, view_directions, light, fg_table(), **settings).rgb
+        return shade(materials, normals, view_directions, light, fg_table()).rgb
 
     np.testing.assert_allclose(run(normals), run(-normals), atol=ROUNDING)
-    np.testing.assert_allclose(run(normals), run(normals, two_sided=False), atol=ROUNDING)
-    one_sided_rgb = run(-normals, two_sided=False)
-    assert np.all(np.isfinite(one_sided_rgb))
-    assert np.max(np.abs(one_sided_rgb - run(-normals))) > 0.05
 
 
 def test_baked_diffuse_is_not_multiplied_by_the_light():

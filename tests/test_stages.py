@@ -325,6 +325,20 @@ def test_the_first_stage_of_another_run_can_be_taken_over_bit_for_bit(
 
 
 @pytest.mark.slow
+def test_a_stage_with_other_settings_does_not_take_over_the_plan_of_its_buffers(
+    dataset, whole, tmp_path
+):
+    transport = "stages.monte_carlo.transport.kind=split_sum"
+    first_folder, later_folder = tmp_path / "first", tmp_path / "later"
+    begin = TakeOver(whole[0], "monte_carlo")
+    fit(dataset, tiny_config(*RUN, transport), first_folder, begin=begin)
+    begin = TakeOver(first_folder, "monte_carlo")
+    fit(dataset, tiny_config(*RUN), later_folder, begin=begin, stop_after=4)
+    assert "cell_patches" not in lines_of(first_folder)[0]["capacities"]
+    assert "cell_patches" in lines_of(later_folder)[0]["capacities"]
+
+
+@pytest.mark.slow
 def test_a_run_that_ended_with_its_first_stage_can_be_taken_further(dataset, whole, tmp_path):
     """The later stages of the first run may differ; here it had none."""
     first_folder, later_folder = tmp_path / "first", tmp_path / "later"

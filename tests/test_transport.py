@@ -20,7 +20,7 @@ from geosplat_jax.render import RenderPipeline
 from geosplat_jax.transport import bsdf
 from geosplat_jax.transport import indirect as indirect_module
 from geosplat_jax.transport.base import TransportSettings
-from geosplat_jax.transport.denoise import DENOISER_INPUTS, DenoiseSpec, denoised
+from geosplat_jax.transport.denoise import DENOISER_INPUTS, DenoiseSpec, denoise_view
 from geosplat_jax.transport.environment import LightSpec
 from geosplat_jax.transport.estimators import gather, reflect
 from geosplat_jax.transport.indirect import ConstantIndirect
@@ -585,7 +585,7 @@ def test_the_filter_without_passes_is_the_identity_to_the_bit():
     }
     alpha = jnp.asarray(rng.uniform(0, 1, (9, 7)), jnp.float32).at[:2].set(0.0)
     focal = jnp.asarray(20.0)
-    run = jax.jit(denoised, static_argnames="spec")
+    run = jax.jit(denoise_view, static_argnames="spec")
     same_images = run(images, alpha, spec=DenoiseSpec(iterations=0), focal=focal)
     for name, image in images.items():
         np.testing.assert_array_equal(same_images[name], image)

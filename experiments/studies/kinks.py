@@ -48,7 +48,7 @@ from geosplat_jax.geometry import FlexiCubes
 from geosplat_jax.hashgrid import Layer, encode
 from geosplat_jax.io.checkpoints import latest_checkpoint, load_checkpoint
 from geosplat_jax.io.dataset import Dataset
-from geosplat_jax.losses import compare, random_background
+from geosplat_jax.losses import over_background, random_background
 from geosplat_jax.materials import to_unit_cube
 from geosplat_jax.pipeline import Pipeline
 from geosplat_jax.render import Asset, Params
@@ -148,7 +148,7 @@ def _residual(rgb: jax.Array, alpha: jax.Array, batch: Batch, pipeline: Pipeline
         key = jax.random.split(batch.view(number).key)[0]
         backgrounds.append(random_background(key, shape, rgb.dtype, kind))
     backgrounds = jnp.concatenate(backgrounds)
-    images = compare(rgb, alpha, batch.image, backgrounds, batch.valid, srgb=False)
+    images = over_background(rgb, alpha, batch.image, backgrounds, batch.valid, srgb=False)
     return images.predicted - images.target
 
 

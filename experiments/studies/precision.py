@@ -45,11 +45,11 @@ from geosplat_jax.hashgrid import HashGridSpec, Layer, encode
 from geosplat_jax.io.dataset import Dataset, load_dataset
 from geosplat_jax.io.images import encode_srgb
 from geosplat_jax.losses import (
-    compare,
     image_dissimilarity,
     image_l1,
-    light_agreement,
+    light_error,
     mask_error,
+    over_background,
 )
 from geosplat_jax.materials import (
     ROUGHNESS_MINIMUM,
@@ -464,7 +464,9 @@ def loss_stages(
         def function(x: Any, constants: Any) -> dict[str, Any]:
             image, backdrop, coverage_mask = constants
             rgb = coverage_mask[..., None] * tone_map(x["rgb"], x["exposure"])
-            images = compare(rgb, coverage_mask * x["alpha"], image, backdrop, None, srgb=False)
+            images = over_background(
+                rgb, coverage_mask * x["alpha"], image, backdrop, None, srgb=False
+            )
             return {term: PHOTOMETRIC[term](images)}
 
         return Stage(f"loss: {term}", function, photo, (batch.image[:1], background, coverage_mask))
@@ -477,7 +479,7 @@ def loss_stages(
         return {"smoothness": variations.albedo + variations.roughness + variations.metallic}
 
     def light(x: Any, image: Any) -> dict[str, Any]:
-        return {"light": light_agreement(x["diffuse"], x["specular"], x["exposure"], image)}
+        return {"light": light_error(x["diffuse"], x["specular"], x["exposure"], image)}
 
     def entropy(x: Any, pipeline: Any) -> dict[str, Any]:
         return {"entropy": sdf_entropy(x["geometry"], pipeline.surface.grid)}
@@ -532,7 +534,9 @@ def half_rows(params: Params, batch: Batch, pipeline: Pipeline) -> dict[str, Any
         rgb = tone_map(intermediates["image"], params.log_exposure)
         target = batch.image[:1]
         black = jnp.zeros_like(target[..., :3])
-        images = compare(rgb[None], intermediates["alpha"][None], target, black, None, srgb=False)
+        images = over_background(
+            rgb[None], intermediates["alpha"][None], target, black, None, srgb=False
+        )
         weights = {"l1": 0.8, "ssim": 0.2, "mask": 5.0}
         total = sum(weight * PHOTOMETRIC[name](images) for name, weight in weights.items())
         return total, rgb + (1.0 - intermediates["alpha"])[..., None]

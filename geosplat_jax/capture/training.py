@@ -47,7 +47,7 @@ from geosplat_jax.io.documents import parse_json
 from geosplat_jax.io.images import written_aside
 from geosplat_jax.io.layouts.colmap import Points
 from geosplat_jax.io.views import Views
-from geosplat_jax.losses import compare, image_dissimilarity, image_l1, random_background
+from geosplat_jax.losses import image_dissimilarity, image_l1, over_background, random_background
 from geosplat_jax.report.metrics import psnr, psnr_of_mse
 from geosplat_jax.splats.radiance import RadianceSplats, render_radiance
 from geosplat_jax.splats.relocation import DEAD_OPACITY, exploring_noise, relocate
@@ -189,7 +189,7 @@ def radiance_loss(
         [linear_to_srgb(batch.image[..., :3]), batch.image[..., 3:]], axis=-1
     )
     backdrop = random_background(batch.key, (1, *rgb.shape), rgb.dtype, background)
-    images = compare(rgb[None], alpha[None], photograph, backdrop, batch.valid, srgb=False)
+    images = over_background(rgb[None], alpha[None], photograph, backdrop, batch.valid, srgb=False)
     in_use = (jnp.arange(splats.capacity, dtype=jnp.int32) < count).astype(rgb.dtype)
     share = in_use / jnp.maximum(count, 1).astype(rgb.dtype)
     total = (

@@ -33,7 +33,7 @@ EXAMPLES = {
     "view": "view runs/duck --env examples",
     "relight": "relight runs/duck --env examples/sunset.hdr --turntable 48",
     "refine-cameras": "refine-cameras runs/duck --output cameras.json",
-    "export": "export runs/duck --faces 20000 --obj",
+    "export": "export runs/duck --faces 4000 --obj",
     "gradcheck": "gradcheck bsdf --sweep",
 }
 """An example of every command, shown at the end of its help."""

@@ -97,8 +97,10 @@ def _poses(arguments: argparse.Namespace) -> None:
         "time: " + ", ".join(f"{part} {seconds:.0f} s" for part, seconds in report.seconds.items())
     )
     print(f"model: {report.model}")
-    next_command = shlex.join(["geosplat-jax", "train", str(arguments.folder)])
-    print(f"next: masks of the object (docs/captures.md), then {next_command}")
+    masks_command, train_command = (
+        shlex.join(["geosplat-jax", name, str(arguments.folder)]) for name in ("masks", "train")
+    )
+    print(f"next: masks of the object, by {masks_command} or by hand; then {train_command}")
 
 
 def _masks(arguments: argparse.Namespace) -> None:

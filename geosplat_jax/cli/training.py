@@ -340,16 +340,17 @@ def train(arguments: argparse.Namespace) -> None:
     folder = arguments.output or Path("runs") / arguments.scene.resolve().name
     if arguments.force and arguments.source and arguments.source.resolve() == folder.resolve():
         raise UsageError("--force would remove the run that --from reads; take another --output")
-    request = _request_of(arguments, RunFolder(folder))
-    config, reading = request.config, dict(request.reading)
     run_folder = RunFolder(folder)
+    if not arguments.resume and arguments.hosts is None:
+        # Before the scene is read, which may take long.
+        run_folder.require_free(replace=arguments.force)
+    request = _request_of(arguments, run_folder)
+    config, reading = request.config, dict(request.reading)
     if arguments.refine_cameras is not None and arguments.resume and run_folder.exists:
         if not run_folder.record()["dataset"].get("cameras"):
             raise UsageError(f"{folder} was begun without --refine-cameras; leave it out")
     # The record of a resumed run names its refined cameras already.
     if arguments.refine_cameras is not None and not request.goes_on:
-        if not arguments.resume:
-            run_folder.require_free(replace=arguments.force)
         reading["cameras"] = _refined_cameras(arguments, folder, reading, config.geometry)
     dataset = load_recorded(arguments.scene, reading)
     if arguments.resume and run_folder.exists:

@@ -10,6 +10,9 @@ _SRGB_KNEE_LINEAR = 0.0031308
 _SRGB_KNEE_ENCODED = 0.04045
 
 _LARGEST_LOG_EXPOSURE = 60.0
+
+_TONE_MAP_BETA = 100.0
+"""The beta of the softplus in `tone_map`."""
 """Largest logarithm of an exposure: e^60 = 1e26 times a radiance of 1e5 is finite in float32."""
 
 
@@ -44,21 +47,18 @@ def expose(rgb: Float[Array, "... 3"], log_exposure: Float[Array, ""]) -> Float[
     return jnp.exp(jnp.minimum(log_exposure, _LARGEST_LOG_EXPOSURE)) * rgb
 
 
-def tone_map(
-    rgb: Float[Array, "... 3"], log_exposure: Float[Array, ""], *, sharpness: float = 100.0
-) -> Float[Array, "... 3"]:
+def tone_map(rgb: Float[Array, "... 3"], log_exposure: Float[Array, ""]) -> Float[Array, "... 3"]:
     """Expose linear radiance and clip it softly at one.
 
-    ``1 - softplus_beta(1 - exposure * rgb)``: the identity below one, one above, with a knee of
-    width ``1 / sharpness`` through which gradients still pass, so that an over-exposed pixel is
-    not lost to the optimiser.
+    ``1 - softplus_beta(1 - exposure * rgb)`` with beta = 100: the identity below one, one above,
+    with a knee of width 1 / beta through which gradients still pass, so that an over-exposed pixel
+    is not lost to the optimiser.
 
     Parameters
     ----------
     rgb : (..., 3) linear radiance.
     log_exposure : () natural logarithm of the exposure; values above 60 count as 60, and have no
         gradient.
-    sharpness : the beta of the softplus.
     """
     headroom = 1.0 - expose(rgb, log_exposure)
-    return 1.0 - jax.nn.softplus(sharpness * headroom) / sharpness
+    return 1.0 - jax.nn.softplus(_TONE_MAP_BETA * headroom) / _TONE_MAP_BETA

@@ -1,8 +1,9 @@
-"""Safe elementary functions and every epsilon of the project, by name.
+"""Safe elementary functions, and the epsilons that several modules share.
 
-Each function is finite, and has a finite gradient, on *all* finite input whose exact result is
-representable (tested over 40 decades), row by row: the argument is made safe first and the result
-selected second, so that an unselected branch cannot put a NaN into the gradient of its neighbours.
+Each function except `fast_arctan2` is finite, and has a finite gradient, on *all* finite input
+whose exact result is representable (tested over 40 decades), row by row: the argument is made safe
+first and the result selected second, so that an unselected branch cannot put a NaN into the
+gradient of its neighbours.
 """
 
 import jax

@@ -127,11 +127,11 @@ def ssim(
     divisor = (squares + luminance_floor) * (variances + contrast_floor)
     if valid is None:
         return jnp.mean(similarity / divisor)
-    counts = _pad_to_window(jnp.asarray(valid)[..., None])[..., 0]
+    window_valid = _pad_to_window(jnp.asarray(valid)[..., None])[..., 0]
     window = (WINDOW_SIZE, WINDOW_SIZE)
-    counts = jax.lax.reduce_window(
-        jax.lax.stop_gradient(counts), 1.0, jax.lax.min, window, (1, 1), "valid"
+    window_valid = jax.lax.reduce_window(
+        jax.lax.stop_gradient(window_valid), 1.0, jax.lax.min, window, (1, 1), "valid"
     )
-    dissimilarity = (1.0 - similarity / divisor).reshape(*counts.shape, channels)
-    total = jnp.sum(dissimilarity * counts[..., None])
-    return 1.0 - safe_divide(total, channels * jnp.sum(counts))
+    dissimilarity = (1.0 - similarity / divisor).reshape(*window_valid.shape, channels)
+    total = jnp.sum(dissimilarity * window_valid[..., None])
+    return 1.0 - safe_divide(total, channels * jnp.sum(window_valid))

@@ -188,7 +188,8 @@ class Box(eqx.Module):
     Attributes
     ----------
     center : (3,) world.
-    half_extent : () half of the cube's side, world units; the unit of length of the paper.
+    half_extent : () half of the cube's side, world units; the unit of length of the paper, whose
+        box is [-1, 1]^3.
     """
 
     center: Float[Array, " 3"]

@@ -658,7 +658,7 @@ def adopted_loop(
     if changes:
         raise TrainingError(
             f"up to the stage {previous.name}, {source} had other settings: {'; '.join(changes)}; "
-            "train it anew"
+            "give the settings of that run (--quality, --set), or train it anew"
         )
     tree, description = read_checkpoint(path, source_config)
     steps_done, end = int(tree["state"].step), config.first_step(name)
@@ -671,4 +671,7 @@ def adopted_loop(
         )
     loop = new_loop(dataset, config, folder, devices)
     _put(loop, tree, description)
+    if source_config.stage(name) != config.stage(name):
+        # The checkpoint's plan of the next stage is for the settings of the other run.
+        loop.to_come = None
     return loop

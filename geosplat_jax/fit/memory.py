@@ -8,6 +8,7 @@ can therefore not work, and others may still need more memory. How much a progra
 once it is compiled, and checked before it runs (`require_program_memory`).
 """
 
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from geosplat_jax.fit.planning import TrainingError
 from geosplat_jax.fit.pyramid import level_sizes
 from geosplat_jax.io.dataset import Dataset
 from geosplat_jax.io.memory import Need, accelerator_refusal, memory_refusal
+from geosplat_jax.io.windows import window_size
 from geosplat_jax.materials import init_materials
 
 _COPIES_LEARNED = 4
@@ -40,7 +42,7 @@ def training_needs(config: Config, dataset: Dataset) -> list[Need]:
     Stages follow one another, so where they need different amounts, the largest counts.
     """
     train, test = dataset.train, dataset.test
-    pixels = train.height * train.width
+    pixels = math.prod(window_size(train, largest=config.run.window))
     images = train.images.nbytes + test.images.nbytes
     views = max((min(stage.batch_views, len(train)) for stage in config.active_stages), default=0)
     light = _light_numbers(config) * _FLOAT_BYTES

@@ -346,7 +346,7 @@ _MESH_RATE = 0.3
 (docs/meshes.md)."""
 
 _MESH_RATE_ORIGINAL = 1e-4
-"""Rate of a mesh's vertices in appendix H, in units of half the longest side of the box."""
+"""Rate of a mesh's vertices in appendix H, in half extents of the box."""
 
 _MESH_WEIGHTS: dict[str, dict[str, float]] = {
     "default": {"laplacian": 0.3, "normal_consistency": 0.1, "edge_length": 0.01, "offset": 0.0},

@@ -10,15 +10,15 @@ from geosplat_jax.core.capacity import Capacities
 from geosplat_jax.core.color import linear_to_srgb, tone_map
 from geosplat_jax.gradcheck.differences import Problem
 from geosplat_jax.losses import (
-    compare,
     edge_aware_smoothness,
     image_dissimilarity,
     image_l1,
-    light_agreement,
     light_cast,
+    light_error,
     light_smoothness,
     light_tint,
     mask_error,
+    over_background,
     white_balance,
 )
 from geosplat_jax.splats.projection import project
@@ -147,7 +147,7 @@ def loss_term_problems(rng: np.random.Generator) -> list[Problem]:
     def photometric(srgb: bool) -> Problem:
         def function(inputs: dict[str, Any], constants: Any) -> dict[str, Any]:
             rgb = tone_map(inputs["rgb"], inputs["log_exposure"])
-            images = compare(
+            images = over_background(
                 rgb, inputs["alpha"], constants["image"], inputs["background"], None, srgb=srgb
             )
             return {
@@ -167,7 +167,7 @@ def loss_term_problems(rng: np.random.Generator) -> list[Problem]:
         return Problem(name, function, inputs, {"image": image})
 
     def light(inputs: dict[str, Any], constants: Any) -> dict[str, Any]:
-        return {"light term": light_agreement(**inputs, image=constants["image"])}
+        return {"light term": light_error(**inputs, image=constants["image"])}
 
     def others(inputs: dict[str, Any], constants: Any) -> dict[str, Any]:
         return {

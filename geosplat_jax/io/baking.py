@@ -1,6 +1,7 @@
 """Mesh decimation, and normal maps that show the detail which a decimated mesh has lost."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -26,6 +27,13 @@ def _middle_and_scale(vertices: Float[np.ndarray, "V 3"]) -> tuple[np.ndarray, f
     return 0.5 * (low + high), _SIZE / size if size > 0 else 1.0
 
 
+def simplification_library() -> Any:
+    """Return the package that reduces meshes; `SceneError` where it is not installed."""
+    return optional_package(
+        "fast_simplification", "a mesh of fewer faces", extra="mesh", package="fast-simplification"
+    )
+
+
 def simplified(
     vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"], count: int
 ) -> tuple[Float[np.ndarray, "W 3"], Int[np.ndarray, "G 3"]]:
@@ -47,9 +55,7 @@ def simplified(
     """
     if count < 4:
         raise ValueError(f"a mesh has at least 4 faces, got {count}")
-    library = optional_package(
-        "fast_simplification", "a mesh of fewer faces", extra="mesh", package="fast-simplification"
-    )
+    library = simplification_library()
     if count >= len(faces):
         return vertices, faces
     middle, scale = _middle_and_scale(np.asarray(vertices, np.float64))

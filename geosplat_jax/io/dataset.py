@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial import ConvexHull
 
 from geosplat_jax.core.types import Bounds
 from geosplat_jax.io.cameras import cameras_digest, read_cameras, with_cameras
@@ -72,6 +73,11 @@ _FAR_SIZES = 1000.0
 """An object that lies farther from the origin than this many times its size causes a warning: at
 that distance rounding may draw its points .04 pixels off, for a focal length of 800 pixels."""
 
+_BOX_MARGIN = 1.0
+"""Pixels by which a mask may exceed the outline of a given box."""
+_LARGEST_OUTSIDE = 0.02
+"""Share of the masks' pixels that may lie outside of a given box without a warning."""
+
 _NARROW_DEG = 20.0
 """Degrees. If the largest angle between two cameras, as seen from the object, is smaller, the
 cameras see one side of the object only."""
@@ -79,7 +85,8 @@ _COARSE_PIXELS = 256
 _COARSE_VIEWS = 16
 _NEEDS_MASKS = (
     "training and evaluation need to tell the object from the background: write RGBA images, name "
-    "a mask_path for each frame, or add masks/NAME.png, white on the object (docs/captures.md)"
+    "a mask_path for each frame, or add masks/NAME.png, white on the object (docs/captures.md); "
+    "for a capture, the command `geosplat-jax masks SCENE` makes them"
 )
 
 
@@ -191,6 +198,7 @@ def load_dataset(
         box = object_bounds(splits["train"], others=splits["test"].camera_to_world[:, :3, 3])
     else:
         box = _checked_bounds(bounds)
+        _check_reach(splits["train"], box, warnings)
     _check_box(splits, box, warnings)
     return Dataset(
         name=root.resolve().name,
@@ -492,6 +500,29 @@ def _check_sides(views: Views, bounds: Bounds, warnings: list[str]) -> None:
             f"train: all {len(views)} cameras see the object from one side, within {widest:.1f} "
             "degrees; its shape away from them cannot be known. Check the poses, or photograph "
             "all around the object"
+        )
+
+
+def _check_reach(views: Views, bounds: Bounds, warnings: list[str]) -> None:
+    """Warn of an object that reaches beyond the box that was given for it."""
+    corners = np.stack(np.meshgrid(*np.transpose(bounds), indexing="ij"), axis=-1).reshape(-1, 3)
+    total, outside = 0, 0
+    for number in range(len(views) if views.has_masks else 0):
+        pose = views.world_to_camera[number]
+        local = (corners @ pose[:3, :3].T + pose[:3, 3]) @ views.intrinsics[number].T
+        if (local[:, 2] <= 0).any():
+            continue
+        outline = ConvexHull(local[:, :2] / local[:, 2:])
+        row, column = np.nonzero(views.mask(number))
+        points = np.stack([column, row], axis=-1) + 0.5
+        distance = points @ outline.equations[:, :2].T + outline.equations[:, 2]
+        total += len(points)
+        outside += int((distance.max(axis=1, initial=-np.inf) > _BOX_MARGIN).sum())
+    if outside > _LARGEST_OUTSIDE * total:
+        warnings.append(
+            f"train: {outside / total:.0%} of the object's pixels lie outside the given bounds; "
+            "the surface ends at the sides of that box and is open there. Give wider bounds, or "
+            "none"
         )
 
 

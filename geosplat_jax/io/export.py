@@ -390,13 +390,14 @@ def export_mesh_glb(
     obj_path : also write the mesh and its textures as OBJ, with MTL and PNG files beside it.
     usd_path : also write them as USD, ``*.usdc``, with PNG files beside it.
     face_count : first reduce the mesh to about this many faces, and write the normals of the full
-        mesh into a normal map, with tangents; None for the mesh as it is.
+        mesh into a normal map, with tangents. None for the mesh as it is, which it also stays if it
+        has no more faces.
 
     Returns
     -------
     dict with the counts of ``vertices``, ``faces`` and ``dropped_faces``, whether the mesh is
-    ``closed`` and was ``flipped``, the ``seconds`` taken and, for textures, ``charts``,
-    ``texture_coverage``, ``unwrap_seconds`` and ``bake_seconds``.
+    ``closed``, was ``flipped`` and was ``reduced`` to fewer faces, the ``seconds`` taken and, for
+    textures, ``charts``, ``texture_coverage``, ``unwrap_seconds`` and ``bake_seconds``.
 
     Raises
     ------
@@ -424,7 +425,9 @@ def export_mesh_glb(
         np.asarray(normals, np.float32),
     )
     fine = None
-    if face_count is not None:
+    info["reduced"] = False
+    if face_count is not None and face_count < len(faces):
+        info["reduced"] = True
         fine = FineSurface(vertices, normals, faces)
         vertices, faces = simplified(vertices, faces, face_count)
         faces = faces[nondegenerate(vertices, faces)]

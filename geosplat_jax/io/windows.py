@@ -34,13 +34,11 @@ def around_object(views: Views, *, largest: float) -> tuple[Views, float]:
         window is its mean over the photograph divided by this share. (SSIM leaves out a border of
         five pixels of either image, so that its mean falls a little more.)
     """
-    if not views.has_masks or largest <= 0.0:
+    chosen_windows = _chosen(views, largest)
+    if chosen_windows is None:
         return views, 1.0
-    corners, size = _windows(views)
-    share = float(np.prod(size)) / (views.height * views.width)
-    if share > largest:
-        return views, 1.0
-    height, width = (int(length) for length in size)
+    corners, (height, width) = chosen_windows
+    share = height * width / (views.height * views.width)
 
     intrinsics = views.intrinsics.copy()
     intrinsics[:, 0, 2] -= corners[:, 1]
@@ -64,6 +62,23 @@ def around_object(views: Views, *, largest: float) -> tuple[Views, float]:
             else 1.0
         )
     return windows, share
+
+
+def window_size(views: Views, *, largest: float) -> tuple[int, int]:
+    """Height and width in pixels of what `around_object` returns."""
+    chosen_windows = _chosen(views, largest)
+    return (views.height, views.width) if chosen_windows is None else chosen_windows[1]
+
+
+def _chosen(views: Views, largest: float) -> tuple[Int[np.ndarray, "V 2"], tuple[int, int]] | None:
+    """Return upper left corners, and height and width, of the windows to use; None for none."""
+    if not views.has_masks or largest <= 0.0:
+        return None
+    corners, size = _windows(views)
+    height, width = (int(length) for length in size)
+    if height * width / (views.height * views.width) > largest:
+        return None
+    return corners, (height, width)
 
 
 def _windows(views: Views) -> tuple[Int[np.ndarray, "V 2"], Int[np.ndarray, " 2"]]:

@@ -10,7 +10,9 @@ from geosplat_jax.core.capacity import Usage
 
 
 class RayIndex(eqx.Module):
-    """A surface in a structure that rays are traced against. Exact, and without gradients.
+    """An acceleration structure for rays against a surface (elsewhere often a BVH, here a grid).
+
+    Exact, and without gradients.
 
     Attributes
     ----------

@@ -1,8 +1,9 @@
-"""What the cells of a grid list, and what of it concerns a ray.
+"""Cells of a uniform grid, packed for ray traversal: entries, empty cubes, cones of normals.
 
-A cell has a word: which entries it lists, or how far a ray may go from it without meeting a cell
-that lists any. It also has a cone around the normals of its entries, which tells whether a ray that
-meets front faces only may pass it. How rays walk by them is said in `walking`.
+A cell's *word* packs the number of its entries and the row of the first or, for an empty cell, the
+sizes of the empty cubes that begin with it towards the eight octants. A *cone* around the normals
+of the entries tells whether a ray that meets front faces only may pass the cell. `walking` uses
+both.
 
 Nothing here is differentiable.
 """

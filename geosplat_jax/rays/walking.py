@@ -1,4 +1,6 @@
-"""Rays that walk through a grid of cells, each of which lists what may be hit in it.
+"""Traversal of a uniform grid of cells by rays, with skipping of empty space.
+
+Rays pass from cell to cell as in Amanatides and Woo 1987; each cell lists what may be hit in it.
 
 What is listed, and how it is tested, belongs to the subclasses of `CellIndex`. A cell without a
 list knows, for each of the eight octants of directions, how large a cube of such cells begins with
@@ -96,7 +98,11 @@ class CellIndex(RayIndex):
 
     @abc.abstractmethod
     def test(self, lanes: Lanes, *, two_sided: bool, any_hit: bool) -> Lanes:
-        """Test the rays against the next entries of their cells."""
+        """Test travelling rays against the next entries of their cells.
+
+        Advances ``tested``, and keeps the nearest hit in ``distance`` and ``face``. With
+        ``any_hit`` (static) it sets ``face`` to 0 instead and stops the ray.
+        """
 
     @property
     def place_size(self) -> Float[Array, ""]:
@@ -184,7 +190,7 @@ def _advance(lanes: Lanes, index: CellIndex, *, two_sided: bool) -> Lanes:
     exits, exit_distance, skip = jax.lax.optimization_barrier((exits, exit_distance, skip))
 
     # The axis of the exit is stepped exactly; the others follow from the position, in bounds.
-    is_open = jnp.ones_like(is_moving)
+    is_undecided = jnp.ones_like(is_moving)
     is_outside = ~jnp.isfinite(exit_distance)
     cells = []
     for axis, size in enumerate(index.grid.shape):
@@ -192,8 +198,8 @@ def _advance(lanes: Lanes, index: CellIndex, *, two_sided: bool) -> Lanes:
         exit_cell = jnp.floor(o + jnp.where(is_outside, 0.0, exit_distance) * d).astype(jnp.int32)
         cells_ahead, cells_behind = jnp.where(d < 0, 0, skip - 1), jnp.where(d < 0, skip - 1, 0)
         exit_cell = jnp.clip(exit_cell, c - cells_behind, c + cells_ahead)
-        is_exit = is_open & (exits[axis] <= exit_distance)
-        is_open = is_open & ~is_exit
+        is_exit = is_undecided & (exits[axis] <= exit_distance)
+        is_undecided = is_undecided & ~is_exit
         next_cell = jnp.where(is_exit, jnp.where(d > 0, c + skip, c - skip), exit_cell)
         is_outside = is_outside | (next_cell < 0) | (next_cell >= size)
         cells.append(jnp.where(is_moving, jnp.clip(next_cell, 0, size - 1), c))
@@ -331,14 +337,14 @@ def trace(
     if ray_count == 0:
         return jnp.zeros((0,), origins.dtype), jnp.zeros((0,), jnp.int32)
     most_lanes, fewest_lanes = _lane_counts()
-    half = min(most_lanes, max(fewest_lanes, -(-ray_count // fewest_lanes) * fewest_lanes)) // 2
+    batch = min(most_lanes, max(fewest_lanes, -(-ray_count // fewest_lanes) * fewest_lanes)) // 2
     local = (origins - grid.origin[None, :]) / grid.cell_size
     waiting_set = bit_set(mask)
-    queue, total = jnp.pad(waiting_set.first(capacity=ray_count), (0, half)), waiting_set.count
+    queue, total = jnp.pad(waiting_set.first(capacity=ray_count), (0, batch)), waiting_set.count
 
     def next_ones(queue_start: Int[Array, ""]) -> Lanes:
-        rows = jax.lax.dynamic_slice(queue, (queue_start,), (half,))
-        is_real = queue_start + jnp.arange(half, dtype=jnp.int32) < total
+        rows = jax.lax.dynamic_slice(queue, (queue_start,), (batch,))
+        is_real = queue_start + jnp.arange(batch, dtype=jnp.int32) < total
         lane_origins, lane_directions, lane_sources = (
             values.at[rows].get(mode="promise_in_bounds") for values in (local, directions, source)
         )
@@ -365,15 +371,19 @@ def trace(
     def refill(state: tuple[Array, Lanes, _Hits]) -> tuple[Array, Lanes, _Hits]:
         queue_start, lanes, hits = state
         lanes = jax.tree.map(lambda *x: jnp.concatenate(x), lanes, next_ones(queue_start))
-        lanes, hits = travel(lanes, hits, half)
-        return queue_start + half, _halve(lanes, ray_count), hits
+        lanes, hits = travel(lanes, hits, batch)
+        return queue_start + batch, _halve(lanes, ray_count), hits
 
     hits = (jnp.full((ray_count,), jnp.inf, origins.dtype), jnp.full((ray_count,), -1, jnp.int32))
+    # Whenever half of the lanes are free, the next batch of the queue takes their place. The first
+    # lanes stand for no ray: they begin past the end of the queue.
     state = (jnp.zeros((), jnp.int32), next_ones(total), hits)
     _, lanes, hits = jax.lax.while_loop(lambda state: state[0] < total, refill, state)
-    while half > fewest_lanes:
-        half //= 2
-        lanes, hits = travel(lanes, hits, half)
+    # The queue is empty: the rest move together into ever fewer lanes.
+    active = batch
+    while active > fewest_lanes:
+        active //= 2
+        lanes, hits = travel(lanes, hits, active)
         lanes = _halve(lanes, ray_count)
     distance, face = travel(lanes, hits, 0)[1]
     entry, _ = _entered(local, directions, grid.shape)

@@ -15,9 +15,11 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from geosplat_jax.fit.train import Trained
+from geosplat_jax.io.baking import simplification_library
 from geosplat_jax.io.export import export_gaussians_ply, export_light_exr, export_mesh_glb
 from geosplat_jax.io.images import encode_srgb, write_hdr
 from geosplat_jax.io.meshes import nondegenerate, to_gltf_axes
+from geosplat_jax.io.usd import usd_library
 from geosplat_jax.materials import materials_at
 from geosplat_jax.render import Asset
 from geosplat_jax.report.gallery import FOLDER
@@ -97,6 +99,20 @@ class MaterialSampler:
         return albedo, roughness, metallic
 
 
+def _describe(mesh_info: Mapping[str, Any], face_count: int | None) -> str:
+    """Say in a line what `export_mesh_glb` wrote."""
+    vertices, faces, dropped = (mesh_info[k] for k in ("vertices", "faces", "dropped_faces"))
+    line = f"{vertices} vertices, {faces} faces, {'closed' if mesh_info['closed'] else 'open'}"
+    if dropped:
+        line += f", {dropped} faces without area left out"
+    if "charts" in mesh_info:
+        coverage = mesh_info["texture_coverage"]
+        line += f", {mesh_info['charts']} charts on {coverage:.0%} of the textures"
+    if face_count is not None and not mesh_info["reduced"]:
+        line += f"; not reduced, since it has no more than {face_count} faces"
+    return f"{line}; {mesh_info['seconds']:.1f} s"
+
+
 def export_assets(
     trained: Trained,
     folder: Path,
@@ -132,10 +148,17 @@ def export_assets(
 
     Raises
     ------
+    SceneError
+        If USD or fewer faces are asked for, and the package for it is not installed.
     ValueError
         If the surface is empty.
     """
     tell = on_progress or (lambda part, done, total: None)
+    # Missing packages are named before anything is computed.
+    if usd:
+        usd_library()
+    if face_count is not None:
+        simplification_library()
     tell("surface and splats", 0, 1)
     vertices, faces, normals = Renderer.of(trained).mesh()
     asset = build_asset(trained.pipeline, trained.params)
@@ -173,7 +196,7 @@ def export_assets(
     if usd:
         others[str(folder / "mesh.usdc")] = "the same mesh, with PNG"
     return others | {
-        str(folder / "mesh.glb"): ", ".join(f"{key} {value}" for key, value in mesh_info.items()),
+        str(folder / "mesh.glb"): _describe(mesh_info, face_count),
         str(folder / "gaussians.ply"): f"{count} Gaussians",
         str(folder / "light.exr"): f"{width} x {height} lat-long, z-up, exposure included",
     }

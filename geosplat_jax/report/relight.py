@@ -13,7 +13,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from geosplat_jax.core.types import Camera, EnvLight
-from geosplat_jax.io.images import SceneError, linear_values, read_stored, write_png
+from geosplat_jax.io.images import (
+    MissingFileError,
+    SceneError,
+    linear_values,
+    read_stored,
+    write_png,
+)
 from geosplat_jax.io.movies import check_movie, has_encoder, write_movie
 from geosplat_jax.io.views import ViewLight
 from geosplat_jax.report.consistency import resized
@@ -54,8 +60,12 @@ def load_light(path: str | Path, *, largest: int = LARGEST_LIGHT) -> EnvLight:
         If the file cannot be read, is not twice as wide as high, or holds radiance that is negative
         or not finite.
     """
+    try:
+        stored_pixels = read_stored(path)
+    except MissingFileError:
+        raise MissingFileError(f"there is no environment map {path}") from None
     # A light has no alpha: a fourth channel is ignored.
-    stored_pixels = np.ascontiguousarray(read_stored(path)[..., :3])
+    stored_pixels = np.ascontiguousarray(stored_pixels[..., :3])
     pixels = linear_values(_without_ringing(stored_pixels, path), Path(path))
     if pixels.ndim != 3 or pixels.shape[-1] < 3 or pixels.shape[1] != 2 * pixels.shape[0]:
         raise SceneError(

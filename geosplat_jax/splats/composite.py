@@ -2,8 +2,9 @@
 
 Compositing is associative: a chunk of Gaussians acts on what lies behind it as the affine map
 ``colour + transmittance * behind``. So every chunk is evaluated on its own, and the chunks of a
-tile are joined by a scan over those maps. In reverse, with ``S_i`` the (cotangent-weighted) colour
-seen just behind Gaussian i,
+tile are joined by a scan over those maps. In reverse, with ``g`` the cotangent of a pixel, ``c_i``
+the features of Gaussian i, ``T_i`` the transmittance in front of it, and ``S_i`` the product of
+``g`` with what is seen just behind it,
 
     dL/dalpha_i = T_i (c_i . g - S_i),    S_{i-1} = alpha_i (c_i . g) + (1 - alpha_i) S_i,
 

@@ -136,7 +136,7 @@ def relocate(
 def exploring_noise(
     splats: RadianceSplats, key: Key[Array, ""], *, rate: Float[Array, ""] | float
 ) -> Float[Array, "N 3"]:
-    """Draw noise for the positions: as wide as the splat, and nearly none on opaque ones (Eq. 8).
+    """Draw noise for the positions: as wide as the splat, nearly none above opacity .05 (Eq. 8).
 
     ``rate Sigma xi sigmoid(-100 (o - 0.005))`` with the covariance Sigma of the splat, its opacity
     o, and standard normal numbers xi.

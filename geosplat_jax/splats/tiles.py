@@ -1,8 +1,9 @@
 """Which Gaussians a view can see, in depth order, and which tiles of the image they touch.
 
-Everything here is integer bookkeeping without gradients. The lists are sparse: one *hit* for each
-pair of a Gaussian and a tile that it may touch, sorted by tile and then from front to back, and cut
-into *chunks* of at most `CHUNK_SIZE` hits of one tile, the unit of work of the compositor.
+Everything here is integer bookkeeping without gradients. The lists are sparse: one *hit* (gsplat:
+tile intersection) for each pair of a Gaussian and a tile that it may touch, sorted by tile and then
+from front to back, and cut into *chunks* of at most `CHUNK_SIZE` hits of one tile, the unit of work
+of the compositor.
 """
 
 import equinox as eqx
@@ -166,9 +167,9 @@ def _pixel_bounds(
 
 def _ellipses(splats: Footprints, opacities: Float[Array, " N"]) -> Float[Array, "N 6"]:
     """Slightly enlarged ellipses where alpha is at least 1/255: centre, conic, largest exponent."""
-    reach = safe_log(opacities * splats.compensation / MIN_ALPHA)
-    reach = reach * (1.0 + _EXTENT_SLACK) + _EXTENT_SLACK
-    return jnp.concatenate([splats.means2d, splats.conics, reach[:, None]], axis=-1)
+    largest_exponent = safe_log(opacities * splats.compensation / MIN_ALPHA)
+    largest_exponent = largest_exponent * (1.0 + _EXTENT_SLACK) + _EXTENT_SLACK
+    return jnp.concatenate([splats.means2d, splats.conics, largest_exponent[:, None]], axis=-1)
 
 
 def _meets_tile(
@@ -179,7 +180,7 @@ def _meets_tile(
     The exponent is least at the ellipse's centre if that lies in the rectangle, and otherwise on an
     edge of the rectangle that faces the centre.
     """
-    x, y, xx, xy, yy, reach = ellipses.T
+    x, y, xx, xy, yy, largest_exponent = ellipses.T
 
     def span(middle: Float[Array, " h"], tile: Int[Array, " h"]) -> tuple[Array, Array, Array]:
         low = (tile * size).astype(middle.dtype) + 0.5 - middle
@@ -195,7 +196,8 @@ def _meets_tile(
 
     along_y = jnp.clip(-xy * near_x * safe_divide(jnp.ones_like(yy), yy), low_y, high_y)
     along_x = jnp.clip(-xy * near_y * safe_divide(jnp.ones_like(xx), xx), low_x, high_x)
-    return jnp.minimum(least(near_x, along_y), least(along_x, near_y)) <= reach
+    least_exponent = jnp.minimum(least(near_x, along_y), least(along_x, near_y))
+    return least_exponent <= largest_exponent
 
 
 def _runs(

@@ -136,8 +136,8 @@ def sdf_entropy(
     """
     lattice = lattice_of(grid)
     sdf = lattice.values(geometry.sdf)
-    # For ends of opposite sign BCE(sigmoid(a), sign(b)) = softplus(|a|). The sum over edges is
-    # therefore a sum over vertices, each weighted by the number of its crossed edges.
+    # Eq. 14. For ends of opposite sign BCE(sigmoid(a), sign(b)) = softplus(|a|). The sum over edges
+    # is therefore a sum over vertices, each weighted by the number of its crossed edges.
     crossings = lattice.crossed_edges(sdf)
     magnitude = jnp.where(sdf < 0, -sdf, sdf)
     total = jnp.sum(crossings.astype(magnitude.dtype) * jax.nn.softplus(magnitude))

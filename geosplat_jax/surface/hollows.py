@@ -31,7 +31,7 @@ from scipy.ndimage import (
 )
 
 from geosplat_jax.core.types import Grid
-from geosplat_jax.surface.sightings import Field, Photographed, Where, crossings
+from geosplat_jax.surface.sightings import Field, Photographs, VertexMask, crossings
 
 _LONGEST = 48  # cells along the longest side of the grid that is carved
 _FEWEST_VIEWS = 8  # two halves of four
@@ -72,7 +72,7 @@ class Candidate(NamedTuple):
         halves have hardly any direction of reflection in common.
     """
 
-    region: Where
+    region: VertexMask
     lid: float
     behind: float
     mirror: float
@@ -114,7 +114,7 @@ def carve_hollows(
         return sdf
     fine_field, factor = _laid_out(sdf, grid)
     hull = _coarser(fine_field, factor)
-    views = Photographed.of(world_to_camera, intrinsics, images, valid, grid, factor)
+    views = Photographs.of(world_to_camera, intrinsics, images, valid, grid, factor)
     hollows = [candidate.region for candidate in _candidates(hull, views) if candidate.is_hollow]
     if not hollows:
         return sdf
@@ -138,7 +138,7 @@ def hollow_candidates(
     if len(images) < _FEWEST_VIEWS:
         return []
     fine_field, factor = _laid_out(sdf, grid)
-    views = Photographed.of(world_to_camera, intrinsics, images, valid, grid, factor)
+    views = Photographs.of(world_to_camera, intrinsics, images, valid, grid, factor)
     return _candidates(_coarser(fine_field, factor), views)
 
 
@@ -148,7 +148,7 @@ def _laid_out(sdf: Float[np.ndarray, " G"], grid: Grid) -> tuple[Field, int]:
     return fine_field, -(-max(grid.shape) // _LONGEST)
 
 
-def _candidates(hull: Field, views: Photographed) -> list[Candidate]:
+def _candidates(hull: Field, views: Photographs) -> list[Candidate]:
     """Carve with one half of the views, and let the other half judge every connected part."""
     fit_views, judge_views = views.every_second(0), views.every_second(1)
     field, _ = _carved(hull, fit_views, np.ones(hull.shape, bool), *_FIRST_PASS)
@@ -170,7 +170,7 @@ def _candidates(hull: Field, views: Photographed) -> list[Candidate]:
 
 
 def _mirrored(
-    hull: Field, region: Where, fit_views: Photographed, judge_views: Photographed
+    hull: Field, region: VertexMask, fit_views: Photographs, judge_views: Photographs
 ) -> float:
     """Difference from a hull that mirrors its surroundings.
 
@@ -198,8 +198,8 @@ def _mirrored(
 
 
 def _carved(
-    field: Field, views: Photographed, region: Where, tolerance: float, share: float
-) -> tuple[Field, Where]:
+    field: Field, views: Photographs, region: VertexMask, tolerance: float, share: float
+) -> tuple[Field, VertexMask]:
     """Carve points of the surface in and around a region on which too few views agree, repeatedly.
 
     Parameters
@@ -218,9 +218,10 @@ def _carved(
         sight = views.look(surface, field < 0.0)
         is_consistent = sight.difference(sight.median()) < tolerance
         disagreement = 1.0 - sight.mean(is_consistent.astype(np.float64))
-        carve_mask = (
-            _of_vertices(surface.inside, disagreement, sight.counts, field.shape) > 1.0 - share
+        vertex_disagreement = _of_vertices(
+            surface.inside, disagreement, sight.is_seen_enough, field.shape
         )
+        carve_mask = vertex_disagreement > 1.0 - share
         if not carve_mask.any():
             break
         field = _without(field, carve_mask)
@@ -228,7 +229,7 @@ def _carved(
     return field, region
 
 
-def _advanced(field: Field, views: Photographed, region: Where) -> Field:
+def _advanced(field: Field, views: Photographs, region: VertexMask) -> Field:
     """Move the surface of a region inward where views agree better on what lies deeper."""
     field, region = field.copy(), region.copy()
     for _ in range(2 * max(field.shape)):
@@ -240,7 +241,7 @@ def _advanced(field: Field, views: Photographed, region: Where) -> Field:
             sight = views.sample(surface.position - np.float32(depth) * surface.normal, is_visible)
             spread = np.abs(sight.color - sight.median()).max(-1)
             mean = sight.mean(np.minimum(spread, _WORST))
-            differences.append(np.where(sight.counts, mean, np.inf))
+            differences.append(np.where(sight.is_seen_enough, mean, np.inf))
         depth_differences = np.stack(differences)
         best_index = depth_differences.argmin(0)
         surface_difference = depth_differences[0]
@@ -271,7 +272,7 @@ def _of_vertices(
     return (total / np.maximum(np.bincount(row, minlength=size), 1)).reshape(shape)
 
 
-def _without(field: Field, carve_mask: Where) -> Field:
+def _without(field: Field, carve_mask: VertexMask) -> Field:
     """Put vertices outside, and the surface half a cell from them."""
     field = np.where(carve_mask, np.float32(_EDGE), field)
     is_neighbour = np.asarray(binary_dilation(carve_mask), bool) & (field < -_EDGE)
@@ -291,12 +292,12 @@ class _Judged(NamedTuple):
     outside: Int[np.ndarray, "N 3"]
     difference: Float[np.ndarray, " N"]
 
-    def of(self, vertices: Int[np.ndarray, "N 3"], region: Where) -> Float[np.ndarray, " M"]:
+    def of(self, vertices: Int[np.ndarray, "N 3"], region: VertexMask) -> Float[np.ndarray, " M"]:
         """Differences of those points whose ``vertices`` lie in a region."""
         return self.difference[region[tuple(vertices.T)]]
 
 
-def _judged(field: Field, fit_views: Photographed, judge_views: Photographed) -> _Judged:
+def _judged(field: Field, fit_views: Photographs, judge_views: Photographs) -> _Judged:
     """Compare the median colour of some views with the colours of others."""
     surface, solid = crossings(field), field < 0.0
     fit_sight, judge_sight = fit_views.look(surface, solid), judge_views.look(surface, solid)

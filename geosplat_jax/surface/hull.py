@@ -286,7 +286,7 @@ class _Silhouettes:
     def __init__(self, world_to_camera, intrinsics, masks, valid=None):
         # One view after the other: photographs may be many and large.
         factor = max(1, -(-max(masks.shape[1:]) // _MASK_PIXELS))
-        is_used, coverage, counts, centroids = np.zeros(len(masks), bool), [], [], []
+        is_used, coverage, reduced_valid, centroids = np.zeros(len(masks), bool), [], [], []
         for view, mask in enumerate(masks):
             image = without_haze(np.asarray(mask, np.float32))
             is_used[view] = (image > _COVERED).any()
@@ -296,11 +296,11 @@ class _Silhouettes:
             if valid is not None:
                 is_known = np.asarray(valid[view]) > _COVERED
                 image = _continued(image, is_known)
-                counts.append(_reduced(is_known.astype(np.float32), factor) > _FULL)
+                reduced_valid.append(_reduced(is_known.astype(np.float32), factor) > _FULL)
             coverage.append(_reduced(image, factor))
         if not is_used.any():
             raise ValueError("every mask is empty; check the alpha channel or the mask files")
-        self.counts = np.stack(counts) if counts else None
+        self.valid = np.stack(reduced_valid) if reduced_valid else None
         self.centroids = np.stack(centroids)
         poses = np.asarray(world_to_camera, np.float64)[is_used]
         centers = -np.einsum("vji,vj->vi", poses[:, :3, :3], poses[:, :3, 3])
@@ -411,14 +411,14 @@ def _evaluate(
         jnp.asarray(x, jnp.float32)
         for x in (silhouettes.pinholes, silhouettes.intrinsics, silhouettes.distances)
     )
-    counts = None if silhouettes.counts is None else jnp.asarray(silhouettes.counts)
+    valid = None if silhouettes.valid is None else jnp.asarray(silhouettes.valid)
     results = []
     for start in range(0, points.shape[0], _POINTS_AT_ONCE):
         chunk = points[start : start + _POINTS_AT_ONCE] - silhouettes.origin
         padded = np.zeros((_POINTS_AT_ONCE, 3), np.float32)
         padded[: chunk.shape[0]] = chunk
         worst, seen_counts = _worst_distance(
-            pinholes, intrinsics, distances, counts, jnp.asarray(padded), tolerated=tolerated
+            pinholes, intrinsics, distances, valid, jnp.asarray(padded), tolerated=tolerated
         )
         values = np.where(np.asarray(seen_counts) >= least_seen, np.asarray(worst), np.inf)
         results.append(values[: chunk.shape[0]].astype(np.float32))
@@ -430,7 +430,7 @@ def _worst_distance(
     pinholes: Float[Array, "V 3 4"],
     intrinsics: Float[Array, "V 3 3"],
     distances: Float[Array, "V H W"],
-    counts: Bool[Array, "V H W"] | None,
+    valid: Bool[Array, "V H W"] | None,
     points: Float[Array, "N 3"],
     *,
     tolerated: int,
@@ -442,8 +442,8 @@ def _worst_distance(
 
     def look(carry, view):
         largest, seen_counts = carry
-        pinhole, matrix, distance, is_counted = view
-        value, is_seen = _distance_in_view(pinhole, matrix, distance, is_counted, points)
+        pinhole, matrix, distance, view_valid = view
+        value, is_seen = _distance_in_view(pinhole, matrix, distance, view_valid, points)
         new_largest = []
         for current in largest:
             new_largest.append(jnp.maximum(current, value))
@@ -452,11 +452,11 @@ def _worst_distance(
 
     unseen_value = jnp.full(points.shape[:1], -jnp.inf, points.dtype)
     start = ((unseen_value,) * (tolerated + 1), jnp.zeros(points.shape[:1], jnp.int32))
-    (largest, seen_counts), _ = jax.lax.scan(look, start, (pinholes, intrinsics, distances, counts))
+    (largest, seen_counts), _ = jax.lax.scan(look, start, (pinholes, intrinsics, distances, valid))
     return largest[-1], seen_counts
 
 
-def _distance_in_view(pinhole, intrinsics, distances, counts, points):
+def _distance_in_view(pinhole, intrinsics, distances, valid, points):
     """World distance of points to one silhouette cone, negative inside; -inf where unseen."""
     height, width = distances.shape
     local = jnp.matmul(points, pinhole[:, :3].T, precision="highest") + pinhole[None, :, 3]
@@ -477,11 +477,11 @@ def _distance_in_view(pinhole, intrinsics, distances, counts, points):
     # The clips above keep every index in bounds, so the gathers need not check.
     corner = top * width + left
     flat = distances.reshape(-1).at
-    if counts is not None:
+    if valid is not None:
         pixel_index = jnp.minimum(v.astype(jnp.int32), height - 1) * width
         pixel_index = pixel_index + jnp.minimum(u.astype(jnp.int32), width - 1)
         pixel_index = jnp.where(is_seen, pixel_index, 0)
-        is_seen &= counts.reshape(-1).at[pixel_index].get(mode="promise_in_bounds")
+        is_seen &= valid.reshape(-1).at[pixel_index].get(mode="promise_in_bounds")
     upper_left, upper_right, lower_left, lower_right = (
         flat[corner + step].get(mode="promise_in_bounds") for step in (0, right, down, right + down)
     )

@@ -22,7 +22,7 @@ from geosplat_jax.surface.hull import without_haze
 Field = Float[np.ndarray, "Z Y X"]
 """Signed distances of the vertices of a grid, negative inside."""
 
-Where = Bool[np.ndarray, "Z Y X"]
+VertexMask = Bool[np.ndarray, "Z Y X"]
 """Mask of the vertices of a grid."""
 
 FEWEST_SEEN = 4
@@ -106,7 +106,7 @@ class Sight(NamedTuple):
     seen: Bool[np.ndarray, "V N"]
 
     @property
-    def counts(self) -> Bool[np.ndarray, " N"]:
+    def is_seen_enough(self) -> Bool[np.ndarray, " N"]:
         """Whether enough views see a point."""
         return self.seen.sum(0) >= FEWEST_SEEN
 
@@ -139,7 +139,7 @@ class Sight(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Photographed:
+class Photographs:
     """Photographs, reduced to about one pixel per cell, and their cameras in units of cells.
 
     Attributes
@@ -169,7 +169,7 @@ class Photographed:
         valid: Any,
         grid: Grid,
         factor: int,
-    ) -> "Photographed":
+    ) -> "Photographs":
         """Choose views, reduce their images, and express their cameras in larger cells.
 
         ``factor`` : cells of ``grid`` along the side of a larger cell.
@@ -201,16 +201,16 @@ class Photographed:
             shows,
         )
 
-    def every_second(self, first: int) -> "Photographed":
+    def every_second(self, first: int) -> "Photographs":
         """Return every second view, from number ``first`` on."""
         arrays = {name: getattr(self, name)[first::2] for name in self.__dataclass_fields__}
         return replace(self, **arrays)
 
-    def look(self, surface: Crossings, solid: Where) -> Sight:
+    def look(self, surface: Crossings, solid: VertexMask) -> Sight:
         """Return what the views that see the points of a surface show there."""
         return self.sample(surface.position, self.visible(surface, solid))
 
-    def visible(self, surface: Crossings, solid: Where) -> Bool[np.ndarray, "V N"]:
+    def visible(self, surface: Crossings, solid: VertexMask) -> Bool[np.ndarray, "V N"]:
         """Tell which views see the points of a surface, (V, N).
 
         A view sees a point whose normal faces it (with a cosine above `_FACING`) if nothing blocks

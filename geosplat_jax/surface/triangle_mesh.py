@@ -49,7 +49,7 @@ class VertexOffsets(eqx.Module):
 
     Attributes
     ----------
-    offsets : (V, 3) displacement of every vertex from its start, in units of half the box's side.
+    offsets : (V, 3) displacement of every vertex from its start, in half extents of the box.
     """
 
     offsets: Float[Array, "V 3"] = learned("vertices")

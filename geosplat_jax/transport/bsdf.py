@@ -172,28 +172,6 @@ def specular_lobe(normals: Components, wi: Components, wo: Components, alpha: Ar
     )
 
 
-def evaluate_factors(
-    materials: Materials,
-    normals: Float[Array, "N 3"],
-    wi: Float[Array, "N 3"],
-    wo: Float[Array, "N 3"],
-) -> tuple[Float[Array, " N"], Float[Array, "N 3"], Float[Array, " N"]]:
-    """Split the reflectance into ``base albedo (1 - m) + fresnel strength``; see `evaluate`.
-
-    Returns
-    -------
-    base : (N,) ``1 / pi``; zero where either direction lies below the surface.
-    fresnel : (N, 3) Fresnel reflectance.
-    strength : (N,) ``D G / (4 (n.wi)(n.wo))``; zero where either direction lies below the surface.
-    """
-    alpha = ggx_alpha(materials.roughness)
-    lobe = specular_lobe(_components(normals), _components(wi), _components(wo), alpha)
-    f0 = specular_f0(materials.albedo, materials.metallic)
-    fresnel = f0 + (1 - f0) * lobe.grazing[:, None]
-    base = jnp.where(lobe.is_above, jnp.asarray(1 / math.pi, fresnel.dtype), 0.0)
-    return base, fresnel, lobe.strength
-
-
 def evaluate_lobes(
     materials: Materials,
     normals: Float[Array, "N 3"],
@@ -205,9 +183,13 @@ def evaluate_lobes(
         is_above = (_dot(normals, wi) > 0) & (_dot(normals, wo) > 0)
         diffuse = jnp.where(is_above[:, None], materials.albedo * (1 / math.pi), 0.0)
         return diffuse, jnp.zeros_like(diffuse)
-    base, fresnel, strength = evaluate_factors(materials, normals, wi, wo)
+    alpha = ggx_alpha(materials.roughness)
+    lobe = specular_lobe(_components(normals), _components(wi), _components(wo), alpha)
+    f0 = specular_f0(materials.albedo, materials.metallic)
+    fresnel = f0 + (1 - f0) * lobe.grazing[:, None]
+    base = jnp.where(lobe.is_above, jnp.asarray(1 / math.pi, fresnel.dtype), 0.0)
     diffuse = materials.albedo * ((1 - materials.metallic) * base)[:, None]
-    return diffuse, fresnel * strength[:, None]
+    return diffuse, fresnel * lobe.strength[:, None]
 
 
 def evaluate(

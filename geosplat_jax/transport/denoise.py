@@ -47,7 +47,7 @@ class DenoiseSpec:
     three."""
     normal_sharpness: Annotated[float, Field(ge=0, le=_LARGEST_SHARPNESS)] = 64.0
     """Weights fall by ``exp(-sharpness * (1 - cos))`` with the angle between unit normals, close to
-    the power ``cos^sharpness``; 0 ignores normals. At 64 the weight is 0.37 at 10 degrees and 2e-4
+    the power ``cos^sharpness``; 0 ignores normals. At 64 the weight is 0.38 at 10 degrees and 2e-4
     at 30."""
     depth_sigma: _Sigma = 1.0
     """Distance of a neighbouring pixel from the surface's tangent plane at which the weight is
@@ -165,20 +165,22 @@ def _pair_weights(
     inside = jnp.ones((1, *shape), features.dtype)
     maps = jax.lax.optimization_barrier(jnp.concatenate([features, heights, inside]))
     padded = _pad(maps, spread)
+    height, slope_y, slope_x, flatness = maps[6:10]
     weights = []
     for dy, dx in _taps(shape, spread):
         neighbour = _window(padded, shape, dy, dx, spread)
+        next_height, next_slope_y, next_slope_x, next_flatness, is_inside = neighbour[6:]
         distance = sum((neighbour[k] - maps[k]) ** 2 for k in range(6))
         rise = _harmonic_mean(
-            spread * (dy * maps[7] + dx * maps[8]), spread * (dy * neighbour[7] + dx * neighbour[8])
+            spread * (dy * slope_y + dx * slope_x), spread * (dy * next_slope_y + dx * next_slope_x)
         )
-        plane_offset = neighbour[6] - maps[6] - rise
+        plane_offset = next_height - height - rise
         # The cosine of the less tilted pixel: one on a jump seems steep, and a small cosine would
         # make its weights large.
-        stiffness = jnp.maximum(neighbour[9], maps[9]) / (spread * math.hypot(dy, dx))
+        stiffness = jnp.maximum(next_flatness, flatness) / (spread * math.hypot(dy, dx))
         kernel = _B3[abs(dy)] * _B3[abs(dx)]
         weights.append(
-            kernel * neighbour[10] * jnp.exp(-(distance + plane_offset * plane_offset * stiffness))
+            kernel * is_inside * jnp.exp(-(distance + plane_offset * plane_offset * stiffness))
         )
     if not weights:
         return jnp.zeros((0, *shape), features.dtype)
@@ -283,13 +285,13 @@ DENOISER_INPUTS = (
     "normal",
     "depth",
 )
-"""Images that `denoised` needs beside the colours."""
+"""Images that `denoise_view` needs beside the colours."""
 
 _DARKEST = 1e-6
 """Light below this has no tint."""
 
 
-def denoised(
+def denoise_view(
     images: dict[str, Float[Array, "H W c"]],
     alpha: Float[Array, "H W"],
     *,

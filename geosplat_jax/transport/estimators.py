@@ -115,7 +115,7 @@ def gather(
         directions = jnp.moveaxis(samples.directions, 1, 0)
         diffuse, specular = _arriving(light, restore(rows), directions, samples.hits.T)
         cosine = jnp.maximum(jnp.sum(normals[None] * directions, axis=-1), 0.0)
-        share = samples.weights.T * cosine / np.pi
+        share = samples.weights.T * cosine / np.pi  # Eq. 20, diffuse
         diffuse_light = jnp.sum(diffuse * share[..., None], axis=0)
         is_used = samples.weights[:, :light_count, None] > 0
         light_radiance = jnp.moveaxis(specular[:light_count], 0, 1)
@@ -152,7 +152,7 @@ def _specular_sums(
     density = counts.light * light_density
     density = density + counts.specular * jax.lax.stop_gradient(lobe.density)
     weight = jnp.where(mask[None, :], safe_divide(jnp.ones_like(density), density), 0.0)
-    share = weight * lobe.strength * lobe.cosine
+    share = weight * lobe.strength * lobe.cosine  # Eq. 20, specular
     # The Fresnel factor is f0 + (1 - f0) grazing, and f0 does not depend on the direction.
     bare_sum = jnp.stack([jnp.sum(share * channel, axis=0) for channel in radiance], axis=-1)
     share = share * lobe.grazing
@@ -176,7 +176,9 @@ def reflect(
     finds_nearest: bool = False,
     open_only: bool = False,
 ) -> Shaded:
-    """Light that N points send to their viewers, one bounce after the environment.
+    """Light that N points send to their viewers (Eq. 20).
+
+    It arrives from the environment and, in blocked directions, from ``indirect``.
 
     Parameters
     ----------

@@ -206,9 +206,8 @@ class KnownIndirect(Indirect):
         return radiance, radiance
 
     def incoming(self, directions: Float[Array, "N 3"], hits: Int[Array, " N"]) -> Lobes:
-        """Return the known radiance of all rays, in the order of the values."""
-        radiance = self.values.reshape(-1, 3)
-        return radiance, radiance
+        """Refuse: single rays have no place in the values; see `along`."""
+        raise TypeError("KnownIndirect knows rays by their place in the values; use `along`")
 
 
 INDIRECT_MODELS: dict[str, type[Indirect]] = {

@@ -30,14 +30,15 @@ class LightSampler(eqx.Module):
 
     Attributes
     ----------
-    rows : (1, H) increasing to 1; entry i is the probability of rows 0 to i.
-    columns : (H, W) increasing to 1 along every row; entry j is the probability of columns 0 to j
-        in that row. One table of all texels would run out of float32's digits on large maps.
+    row_cdf : (1, H) marginal, increasing to 1; entry i is the probability of rows 0 to i.
+    column_cdf : (H, W) conditional, increasing to 1 along every row; entry j is the probability of
+        columns 0 to j in that row. One table of all texels would run out of float32's digits on
+        large maps.
     density : (H, W) per steradian.
     """
 
-    rows: Float[Array, "1 H"]
-    columns: Float[Array, "H W"]
+    row_cdf: Float[Array, "1 H"]
+    column_cdf: Float[Array, "H W"]
     density: Float[Array, "H W"]
 
 
@@ -63,16 +64,16 @@ def light_sampler(light: EnvLight) -> LightSampler:
     uniform = solid_angle / (4 * math.pi)
     share = jnp.where(total > 0, (1 - _UNIFORM_SHARE) * share + _UNIFORM_SHARE * uniform, uniform)
     row_shares = jnp.sum(share, axis=1)
-    return LightSampler(_cumulative(row_shares[None]), _cumulative(share), share / solid_angle)
+    return LightSampler(_cdf(row_shares[None]), _cdf(share), share / solid_angle)
 
 
-def _cumulative(share: Float[Array, "R n"]) -> Float[Array, "R n"]:
+def _cdf(share: Float[Array, "R n"]) -> Float[Array, "R n"]:
     """Cumulative sums along every row, divided by the sum of the row."""
     sums = jax.lax.cummax(jnp.cumsum(share, axis=1), axis=1)
     return sums / sums[:, -1:]
 
 
-def _drawn(
+def _invert_cdf(
     tables: Float[Array, "R n"], row: Int[Array, " N"], uniforms: Float[Array, " N"]
 ) -> tuple[Int[Array, " N"], Float[Array, " N"]]:
     """Find the entry of a row into whose interval a number in [0, 1) falls, and the place in it.
@@ -116,8 +117,9 @@ def sample_light(
     density : (N,) per steradian, positive.
     """
     height, width = sampler.density.shape
-    row, down = _drawn(sampler.rows, jnp.zeros(uniforms.shape[:1], jnp.int32), uniforms[:, 0])
-    column, across = _drawn(sampler.columns, row, uniforms[:, 1])
+    first_row = jnp.zeros(uniforms.shape[:1], jnp.int32)
+    row, down = _invert_cdf(sampler.row_cdf, first_row, uniforms[:, 0])
+    column, across = _invert_cdf(sampler.column_cdf, row, uniforms[:, 1])
     azimuth = (0.5 - (column.astype(across.dtype) + across) / width) * (2 * math.pi)
     # Uniform in the cosine between the edges of the row. Written with half angles, because
     # 1 - cos loses all digits next to a pole.

@@ -126,7 +126,7 @@ class MonteCarlo(SampledTransport):
         """Indirect light that belongs to points."""
         return self._model(attributes.indirect) if self._model.belongs_to_points else NO_INDIRECT
 
-    def _by_face(
+    def _learned_by_face(
         self, points: SurfacePoints, attributes: Attributes, face_count: int
     ) -> RadiometricIndirect | None:
         """Indirect light that faces have learned to send."""
@@ -156,18 +156,18 @@ class MonteCarlo(SampledTransport):
         index = self._own_rays(index)
         sampler = light_sampler(light)
         finds_nearest = self._finds_nearest(index)
-        gathered, traced = None, None
+        gathered, by_face = None, None
         if finds_nearest:
             assert index is not None
-            traced = self._by_face(points, attributes, index.face_capacity)
-        is_traced = finds_nearest and traced is None
+            by_face = self._learned_by_face(points, attributes, index.face_capacity)
+        is_traced = finds_nearest and by_face is None
         if self.settings.shares_views or is_traced:
             samples, carry = self._draw_shared(
                 key, points, light, sampler, index, carry, finds_nearest=finds_nearest
             )
             has_specular = attributes.materials.has_specular
             options: dict[str, Any] = {"has_specular": has_specular}
-            indirect = traced or self._learned(attributes)
+            indirect = by_face if by_face is not None else self._learned(attributes)
             gathered = gather(points, samples, light, indirect, **options)
             # What faces send out after one bounce is the indirect light of the next.
             for _ in range(self.settings.bounces if is_traced else 0):
@@ -175,11 +175,11 @@ class MonteCarlo(SampledTransport):
                 face_radiance = outgoing(
                     attributes.materials, gathered.diffuse_light, points, index.face_capacity
                 )
-                traced = TracedIndirect(face_radiance)
-                gathered = gather(points, samples, light, traced, **options)
+                by_face = TracedIndirect(face_radiance)
+                gathered = gather(points, samples, light, by_face, **options)
         if not self.settings.shares_views:
             gathered = None
-        return SampledIllumination(light, sampler, traced, gathered), carry
+        return SampledIllumination(light, sampler, by_face, gathered), carry
 
     def shade(
         self,
@@ -194,7 +194,7 @@ class MonteCarlo(SampledTransport):
         assert key is not None
         index = self._own_rays(index)
         light, sampler, gathered = illumination.light, illumination.sampler, illumination.gathered
-        indirect = illumination.traced
+        indirect = illumination.by_face
         if indirect is None:
             indirect = self._learned(attributes)
         options = {"counts": self._counts, "finds_nearest": self._finds_nearest(index)}

@@ -40,7 +40,12 @@ from geosplat_jax.transport import bsdf
 from geosplat_jax.transport.base import Shaded, TransportSettings
 from geosplat_jax.transport.environment import LightSpec, lookup
 from geosplat_jax.transport.estimators import gather, reflect
-from geosplat_jax.transport.indirect import IndirectSource, KnownIndirect, mean_over_faces
+from geosplat_jax.transport.indirect import (
+    NO_INDIRECT,
+    IndirectSource,
+    KnownIndirect,
+    mean_over_faces,
+)
 from geosplat_jax.transport.light_sampling import (
     LightSampler,
     light_density,
@@ -437,13 +442,13 @@ class Paths(SampledTransport):
         sampler: LightSampler,
         table: FaceTable | None,
         index: RayIndex | None,
-    ) -> dict[str, Any]:
-        """Return the argument ``indirect`` of `gather` and `reflect`; none (black) without rays."""
+    ) -> IndirectSource:
+        """Return the paths' indirect light for `gather` and `reflect`; black without rays."""
         if index is None or table is None:
-            return {}
+            return NO_INDIRECT
         count = self.settings.bounce_count - 1
         gradient = self.settings.later_gradient
-        return {"indirect": PathTracer(key, table, light, sampler, index, count, gradient)}
+        return PathTracer(key, table, light, sampler, index, count, gradient)
 
     def prepare(
         self,
@@ -472,9 +477,9 @@ class Paths(SampledTransport):
             samples, carry = self._draw_shared(
                 first_key, points, light, sampler, index, carry, finds_nearest=True
             )
-            source = self._tracer(later_key, light, sampler, table, index)
+            indirect = self._tracer(later_key, light, sampler, table, index)
             has_specular = attributes.materials.has_specular
-            gathered = gather(points, samples, light, has_specular=has_specular, **source)
+            gathered = gather(points, samples, light, indirect, has_specular=has_specular)
         return PathIllumination(light, sampler, None, gathered, table), carry
 
     def shade(
@@ -489,17 +494,28 @@ class Paths(SampledTransport):
         """Compute the light that points send to their viewers; see `estimators.reflect`."""
         assert key is not None
         light, sampler, gathered = illumination.light, illumination.sampler, illumination.gathered
-        keys = jax.random.split(key, 4)
+        light_key, light_path_key, lobe_path_key, lobe_key = jax.random.split(key, 4)
+        table = illumination.table
         options = {"counts": self._counts, "finds_nearest": True}
         open_only = self._open_only and gathered is not None
         if gathered is None:
-            samples = draw_samples(keys[0], points, sampler, index, **options)
-            source = self._tracer(keys[1], light, sampler, illumination.table, index)
+            samples = draw_samples(light_key, points, sampler, index, **options)
+            indirect = self._tracer(light_path_key, light, sampler, table, index)
             has_specular = attributes.materials.has_specular
-            gathered = gather(points, samples, light, has_specular=has_specular, **source)
-        source = self._tracer(keys[2], light, sampler, illumination.table, index)
-        arguments = (attributes.materials, wo, gathered, light, sampler, index)
-        return reflect(keys[3], points, *arguments, **source, open_only=open_only, **options)
+            gathered = gather(points, samples, light, indirect, has_specular=has_specular)
+        return reflect(
+            lobe_key,
+            points,
+            attributes.materials,
+            wo,
+            gathered,
+            light,
+            sampler,
+            index,
+            self._tracer(lobe_path_key, light, sampler, table, index),
+            open_only=open_only,
+            **options,
+        )
 
     def for_images(self, sample_count: int) -> "SampledTransport":
         """Return a transport as `SampledTransport` does, without gradients at later vertices."""

@@ -12,7 +12,8 @@ balance heuristic over their confidences and targets (Lin et al. 2022)::
 
     m_j(w) = c_j p_j(w) / sum_k c_k p_k(w),    weight_j = m_j(w_j) p(w_j) W_j
 
-with p_k the target of the point that reservoir k comes from. The m_j sum to 1 wherever a target is
+with p the target of the point that chooses and p_k that of the point that reservoir k comes from,
+W_j the weight of reservoir j and c_j its confidence. The m_j sum to 1 wherever a target is
 positive. Joined reservoirs are therefore unbiased if the target of a point is positive exactly in
 the directions that the point can have kept. `ReservoirSettings.visibility` says whether these are
 the visible ones.
@@ -349,10 +350,13 @@ def resample(
     """
     points, light, sampler = jax.lax.stop_gradient((points, light, sampler))
     size, traces = points.normals.shape[0], spec.visibility == "traced"
-    keys = jax.random.split(key, 5)
-    offsets = jax.random.uniform(keys[0], (size, 2), jnp.float32)
+    candidate_key, own_key, previous_key, neighbor_key, joining_key = jax.random.split(key, 5)
+    offsets = jax.random.uniform(candidate_key, (size, 2), jnp.float32)
     dtype = points.normals.dtype
-    uniforms = [jax.random.uniform(k, (size, count), jnp.float32).astype(dtype) for k in keys[1:3]]
+    uniforms = [
+        jax.random.uniform(k, (size, count), jnp.float32).astype(dtype)
+        for k in (own_key, previous_key)
+    ]
     reach = jnp.asarray(jnp.inf, dtype) if index is None else index.place_size.astype(dtype)
     previous_reservoirs = None
     if store is not None and spec.reuse_steps:
@@ -381,10 +385,10 @@ def resample(
     )
     if not spec.neighbors:
         return reservoirs
-    numbers = jax.random.uniform(keys[4], (size, count), jnp.float32)
+    numbers = jax.random.uniform(joining_key, (size, count), jnp.float32)
     neighbors = [
         _offered(_rows(reservoirs, rows), _rows(points, rows), points, rows >= 0, 2 * reach, spec)
-        for rows in _beside(keys[3], points, index, spec.neighbors)
+        for rows in _beside(neighbor_key, points, index, spec.neighbors)
     ]
 
     def with_neighbors(inputs: tuple) -> Reservoirs:
@@ -398,7 +402,7 @@ def resample(
     return in_all(with_neighbors, arguments, count * (spec.neighbors + 1) ** 2)
 
 
-def kept(
+def store_reservoirs(
     store: ReservoirStore,
     points: SurfacePoints,
     reservoirs: Reservoirs,

@@ -13,7 +13,7 @@ from geosplat_jax.core.types import EnvLight, SurfacePoints
 from geosplat_jax.rays.base import RayIndex
 from geosplat_jax.splats.tiles import gather_visible
 from geosplat_jax.transport.base import Illumination, Transport
-from geosplat_jax.transport.denoise import DENOISER_INPUTS, DenoiseSpec, denoised
+from geosplat_jax.transport.denoise import DENOISER_INPUTS, DenoiseSpec, denoise_view
 from geosplat_jax.transport.estimators import Gathered
 from geosplat_jax.transport.indirect import Indirect
 from geosplat_jax.transport.light_sampling import LightSampler
@@ -21,8 +21,8 @@ from geosplat_jax.transport.reservoirs import (
     ReservoirSettings,
     ReservoirStore,
     empty_store,
-    kept,
     resample,
+    store_reservoirs,
 )
 from geosplat_jax.transport.sampling import Chosen, SampleCounts, Samples, draw_samples
 
@@ -33,13 +33,14 @@ class SampledIllumination(Illumination):
     Attributes
     ----------
     light, sampler : environment and its tables.
-    traced : indirect light that faces send out; None where it is not looked up by face.
+    by_face : indirect light that faces send out, traced or learned; None where it is not looked up
+        by face.
     gathered : light that arrives at every point; None where views do not share samples.
     """
 
     light: EnvLight
     sampler: LightSampler
-    traced: Indirect | None
+    by_face: Indirect | None
     gathered: Gathered | None
 
     def take(self, rows: Int[Array, " M"]) -> "SampledIllumination":
@@ -51,18 +52,18 @@ class SampledIllumination(Illumination):
         """Return diffuse light, and indirect light by face."""
         return (
             None if self.gathered is None else self.gathered.diffuse_light,
-            None if self.traced is None else self.traced.values,
+            None if self.by_face is None else self.by_face.values,
         )
 
     def with_parts(self, parts: Any) -> "SampledIllumination":
         """Put averaged parts back; the samples of the light stay."""
         diffuse_light, values = parts
-        gathered, traced = self.gathered, self.traced
+        gathered, by_face = self.gathered, self.by_face
         if gathered is not None:
             gathered = replace(gathered, diffuse_light=diffuse_light)
-        if traced is not None:
-            traced = replace(traced, values=values)
-        return replace(self, gathered=gathered, traced=traced)
+        if by_face is not None:
+            by_face = replace(by_face, values=values)
+        return replace(self, gathered=gathered, by_face=by_face)
 
 
 SampleCount = Annotated[int, Field(ge=0, le=4096)]
@@ -140,7 +141,7 @@ class SampledTransport(Transport):
 
     @property
     def filter_inputs(self) -> tuple[str, ...]:
-        """Names of the images that `denoised` needs; () where the filter is off."""
+        """Names of the images that `denoise_view` needs; () where the filter is off."""
         return DENOISER_INPUTS if self.settings.denoise.iterations > 0 else ()
 
     @property
@@ -150,9 +151,10 @@ class SampledTransport(Transport):
 
     def first_carry(self) -> ReservoirStore | None:
         """Return an empty store where samples are reused in later steps, else None."""
-        spec, count = self.settings.reservoirs, self.settings.light_count
-        uses_store = spec.candidates > 0 and spec.reuse_steps and self.settings.shares_views
-        return empty_store(spec, count) if uses_store and count else None
+        settings = self.settings
+        if not (settings.chooses_samples and settings.reservoirs.reuse_steps):
+            return None
+        return empty_store(settings.reservoirs, settings.light_count)
 
     def _draw_shared(
         self,
@@ -178,7 +180,7 @@ class SampledTransport(Transport):
         samples = draw_samples(key, points, sampler, index, chosen=light_samples, **options)
         if carry is not None:
             hits = samples.hits[:, : counts.light]
-            carry = kept(carry, points, reservoirs, hits, index, spec=spec)
+            carry = store_reservoirs(carry, points, reservoirs, hits, index, spec=spec)
         return samples, carry
 
     @property
@@ -192,10 +194,10 @@ class SampledTransport(Transport):
         alpha: Float[Array, "H W"],
         focal: Float[Array, ""],
     ) -> dict[str, Float[Array, "H W c"]]:
-        """Filter the demodulated light; see `denoised`."""
+        """Filter the demodulated light; see `denoise_view`."""
         if not self.filter_inputs:
             return images
-        return denoised(images, alpha, spec=self.settings.denoise, focal=focal)
+        return denoise_view(images, alpha, spec=self.settings.denoise, focal=focal)
 
     def for_residual(self) -> "SampledTransport | None":
         """Return a transport with ``residual_count`` samples of each kind."""

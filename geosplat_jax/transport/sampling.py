@@ -63,7 +63,10 @@ class Samples(eqx.Module):
     Attributes
     ----------
     directions : (N, S, 3) unit.
-    weights : (N, S) ``1 / (n_light p_light + n_cosine p_cosine)``; 0 where the mask is false.
+    weights : (N, S) for the diffuse lobe: ``1 / (n_light p_light + n_cosine p_cosine)``, times
+        ``light_factors`` for chosen samples of the light; with `Chosen.open_only`, blocked
+        directions weigh 0 for the light and ``1 / (n_cosine p_cosine)`` for the cosine. 0 where the
+        mask is false. Ones, and unused, from `draw_specular`.
     hits : (N, S) int32 face that is hit, `OPEN` or `BLOCKED`.
     light_density : (N, L) density of the light's samples, per steradian.
     distances : (N, S) to the faces that are hit, world units, and infinite elsewhere; None where
@@ -88,13 +91,13 @@ class Chosen(eqx.Module):
     ----------
     directions : (N, L, 3) unit.
     weights : (N, L) unbiased estimate of one over the density of the direction.
-    is_open : static; whether blocked directions have no part in the choice, so that they are left
+    open_only : static; whether blocked directions have no part in the choice, so that they are left
         to the other techniques.
     """
 
     directions: Float[Array, "N L 3"]
     weights: Float[Array, "N L"]
-    is_open: bool = eqx.field(static=True, default=False)
+    open_only: bool = eqx.field(static=True, default=False)
 
 
 def low_discrepancy(
@@ -176,10 +179,8 @@ def cast(
     points: SurfacePoints,
     directions: Float[Array, "S N 3"],
     index: RayIndex | None,
-    *,
-    finds_nearest: bool = False,
 ) -> Int[Array, "S N"]:
-    """Tell where rays end: at a face, `OPEN`, or `BLOCKED` by something; no gradients.
+    """Tell which rays are `OPEN` and which `BLOCKED`; no gradients.
 
     Directions below a point's own face are blocked. Without an index nothing else is.
 
@@ -188,14 +189,11 @@ def cast(
     points : N points where rays start.
     directions : (S, N, 3) unit.
     index : the surface that blocks rays; None for no occlusion.
-    finds_nearest : static; whether to find the face that is hit first, which takes longer.
 
     Returns
     -------
-    (S, N) int32 face, `OPEN` or `BLOCKED`.
+    (S, N) int32 `OPEN` or `BLOCKED`.
     """
-    if finds_nearest and index is not None:
-        return cast_to_faces(points, directions, index)[0]
     points, directions = jax.lax.stop_gradient((points, directions))
     is_below = _below(points, directions)
     if index is None:
@@ -207,7 +205,10 @@ def cast(
 def cast_to_faces(
     points: SurfacePoints, directions: Float[Array, "S N 3"], index: RayIndex
 ) -> tuple[Int[Array, "S N"], Float[Array, "S N"]]:
-    """Find where rays end, as `cast` does, and the distances of the faces; no gradients."""
+    """Find where rays end, and the distances of the faces that they hit; no gradients.
+
+    As `cast`, but a ray that hits a face has its row instead of `BLOCKED`, which takes longer.
+    """
     points, directions = jax.lax.stop_gradient((points, directions))
     is_below = _below(points, directions)
     distance, hits = index.nearest(*_rays(points, directions, is_below))
@@ -271,7 +272,8 @@ def draw_samples(
     points : N points where rays start.
     sampler : tables of the light.
     index : the surface that blocks rays; None for no occlusion.
-    counts, finds_nearest : static; see `SampleCounts` and `cast`.
+    counts : static; see `SampleCounts`.
+    finds_nearest : static; whether to find the face that a ray hits first, see `cast_to_faces`.
     chosen : samples of the light to use; by default they are drawn here.
     """
     points, sampler = jax.lax.stop_gradient((points, sampler))
@@ -301,7 +303,7 @@ def draw_samples(
         directions, weights, light_densities = jnp.moveaxis(directions, 0, 1), weights.T, light.T
         if chosen is None:
             return Samples(directions, weights, hits, light_densities[:, : counts.light], distances)
-        if chosen.is_open:
+        if chosen.open_only:
             # In blocked directions only the samples of the cosine count.
             is_open = hits == OPEN
             cosine_weights = safe_divide(jnp.ones_like(cosine), counts.diffuse * cosine).T

@@ -1,6 +1,6 @@
 """Shading of surface points: the split-sum approximation.
 
-``f_r = albedo (1 - m) / pi + D G F / (4 (n.l)(n.v))`` with GGX D of alpha = roughness^2,
+``f_r = albedo (1 - m) / pi + D G F / (4 (n.wi)(n.wo))`` with GGX D of alpha = roughness^2,
 height-correlated Smith G and Schlick F of ``F0 = 0.04 (1 - m) + albedo m``. The split sum replaces
 the integral of light times specular BRDF by the product of two integrals: the light filtered by
 the lobe (`environment.prefilter`) and the directional albedo ``F0 * scale + bias`` of
@@ -133,42 +133,40 @@ def fg_lookup(
 def split_sum(
     materials: Materials,
     normals: Float[Array, "N 3"],
-    view_directions: Float[Array, "N 3"],
+    wo: Float[Array, "N 3"],
     prefiltered: PrefilteredLight,
     table: Float[Array, "V R 2"],
     *,
-    two_sided: bool = True,
     baked_diffuse: bool = False,
 ) -> Shaded:
     """Shade N points with the split-sum approximation.
+
+    Normals that face away from the viewer are flipped.
 
     Parameters
     ----------
     materials : `Materials` of the N points.
     normals : (N, 3) unit shading normals, world.
-    view_directions : (N, 3) unit, from the point towards the viewer.
+    wo : (N, 3) unit, from the point towards the viewer.
     prefiltered : from `environment.prefilter`; for materials without a specular lobe, its diffuse
         level is enough.
     table : from `fg_table`.
-    two_sided : flip normals that face away from the viewer. Otherwise such points keep their
-        normal and are shaded as at a grazing angle (n.v = 0).
     baked_diffuse : the diffuse part is ``albedo * (1 - metallic)``, not multiplied by the light:
         the albedo field then stores baked radiance (preset `code`).
 
     Returns
     -------
-    Shaded, differentiable in materials, normals, view directions and light. The flip is piecewise
+    Shaded, differentiable in materials, normals, ``wo`` and light. The flip is piecewise
     constant. Zero normals (padding) give finite values and gradients.
     """
-    cosine = jnp.sum(normals * view_directions, axis=-1)
-    if two_sided:
-        sign = jnp.where(cosine < 0, -1.0, 1.0).astype(normals.dtype)
-        normals, cosine = normals * sign[:, None], cosine * sign
+    cosine = jnp.sum(normals * wo, axis=-1)
+    sign = jnp.where(cosine < 0, -1.0, 1.0).astype(normals.dtype)
+    normals, cosine = normals * sign[:, None], cosine * sign
     diffuse_light = prefiltered_diffuse(prefiltered, normals)
     if not materials.has_specular:
         shaded, albedo = matt(materials, diffuse_light), materials.albedo
         return replace(shaded, rgb=albedo, diffuse=albedo) if baked_diffuse else shaded
-    reflected = 2 * cosine[:, None] * normals - view_directions
+    reflected = 2 * cosine[:, None] * normals - wo
     dielectric_share = (1 - materials.metallic)[:, None]
     f0 = specular_f0(materials.albedo, materials.metallic)
 

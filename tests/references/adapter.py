@@ -39,12 +39,12 @@ def face_splats(points, normals, *, preset):
             normal = normalize(weighted(middle, normals))
             up = normalize(area_vector) if preset == "code" else normal
             tangent = normalize(delta - dot(delta, up) * up)
-            means.append(weighted(middle, points))  # Eq. 8
+            means.append(weighted(middle, points))
             shading.append(normal)
-            scale_x = ALPHA[ring] * length(delta) / 2  # Eq. 9
+            scale_x = ALPHA[ring] * length(delta) / 2  # Eq. 10
             scale_y = 2 * area / (BETA[ring] * length(delta))  # Eq. 10
             scales.append([scale_x, scale_y, THICKNESS + 0 * area])
-            columns = (tangent, cross(up, tangent), up)  # Eq. 11
+            columns = (tangent, cross(up, tangent), up)  # Eq. 10
             rotations.append([[column[i] for column in columns] for i in range(3)])
     return {
         "means": np.array(means),
