@@ -210,6 +210,8 @@ def read_entry(folder: Path, run: dict[str, Any], sweep: dict[str, Any], scene: 
         if record["step"] != config.total_steps:
             return Entry({}, {}, f"evaluated at step {record['step']} of {config.total_steps}")
         costs, notes = _costs(folder, record, config)
+        if not (folder / "evaluation.json").exists():
+            notes.append("its evaluation was not finished, or is to be repeated")
         figures = {name: float(value) for name, value in record["mean"].items()}
     except (OSError, ValueError, KeyError, TypeError) as error:
         return Entry({}, {}, f"unreadable: {_without_places(repr(error))}")

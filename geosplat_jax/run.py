@@ -48,7 +48,7 @@ from geosplat_jax.report.protocols import PROTOCOLS
 from geosplat_jax.report.relight import RelightOptions, load_light, load_view_light, relight_views
 from geosplat_jax.report.renderer import DEFAULT_SAMPLES, Renderer
 from geosplat_jax.report.sheets import preview_image
-from geosplat_jax.report.shots import Cameras, Images
+from geosplat_jax.report.shots import Cameras, Images, remove_later_frames
 
 REFINEMENT_SAMPLES = 32
 """Rays per splat when cameras are refined: noise averages out over the pixels of a view."""
@@ -296,6 +296,7 @@ class Run:
         renderer = self.renderer(samples=samples).with_aovs(*images.aovs)
         shots, files = cameras.shots(self.dataset, renderer.center()), []
         folder = self._output(output, "renders")
+        remove_later_frames(folder, shots)
         for name, camera in counted(shots, "views", on_progress):
             files += images.write(folder, name, renderer(camera))
         return files
@@ -339,6 +340,7 @@ class Run:
         )
         shots = cameras.shots(self.dataset, relit_renderer.center())
         folder = self._output(output, f"relight_{Path(env).stem}")
+        remove_later_frames(folder, shots)
         return relight_views(
             relit_renderer, light, shots, folder, options, images, on_progress=on_progress
         )

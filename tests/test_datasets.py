@@ -919,7 +919,7 @@ def test_bounds_that_cut_the_object_are_told(blender):
         return [text for text in warnings if "outside the given bounds" in text]
 
     assert not cuts(1.0)
-    (text,) = cuts(0.7)
+    (text,) = cuts(0.4)
     assert "open there" in text
 
 

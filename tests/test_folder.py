@@ -223,7 +223,7 @@ def test_the_record_keeps_the_path_of_cameras_that_it_was_given(run, monkeypatch
     path.write_text(json.dumps(record))
     (run.path / CAMERAS).write_text("{}")
     monkeypatch.chdir(run.path.parent)
-    assert RunFolder(run.path.name).record()["dataset"]["cameras"] == f"{run.path.name}/{CAMERAS}"
+    assert RunFolder(run.path.name).record()["dataset"]["cameras"] == str(run.path / CAMERAS)
     RunFolder(run.path.name).amend(tiny_config("stages.split_sum.steps=7"))
     assert json.loads(path.read_text())["dataset"]["cameras"] == "/scene/cameras.json"
 

@@ -2,6 +2,7 @@
 
 import json
 import re
+import shlex
 import shutil
 from dataclasses import replace
 
@@ -11,6 +12,7 @@ import pytest
 from PIL import Image
 
 from geosplat_jax.cli import main
+from geosplat_jax.cli.arguments import command_line
 from geosplat_jax.fit.budget import plan
 from geosplat_jax.fit.config import Budget
 from geosplat_jax.fit.folder import RunError, RunFolder
@@ -18,7 +20,14 @@ from geosplat_jax.fit.presets import between_qualities, make_config
 from geosplat_jax.io.checkpoints import save_checkpoint
 from geosplat_jax.io.images import write_hdr
 from geosplat_jax.report import facts, page
-from geosplat_jax.report.facts import changed_from_preset, command, curves, figure, stage_times
+from geosplat_jax.report.facts import (
+    changed_from_preset,
+    command,
+    curves,
+    figure,
+    protocol_text,
+    stage_times,
+)
 from geosplat_jax.report.gallery import comparisons, write_gallery
 from geosplat_jax.report.page import LARGEST_PAGE, Evaluated, report_html
 
@@ -321,6 +330,17 @@ def test_labels_of_ones_own_are_compared_with_the_defaults():
     config = make_config("default", "standard", overrides=("run.seed=3",))
     config = replace(config, preset="mine", quality="fast", material_prior="dull")
     assert changed_from_preset(config) == {"run.seed": (0, 3)}
+    text, is_whole = command({"scene": "s", "dataset": {}}, config)
+    assert is_whole
+    arguments = command_line().parse_args(shlex.split(text.replace("\\\n", " "))[1:])
+    assert (arguments.preset, arguments.quality) == ("default", "standard")
+
+
+def test_a_protocol_says_how_each_kind_of_image_is_compared():
+    text = protocol_text("orb")
+    assert "for PSNR-H and PSNR-L, on the object alone, without a scale" in text
+    assert "albedo on the object alone, each channel of each image scaled" in text
+    assert "PSNR-H" not in protocol_text("geosplatting")
 
 
 def test_settings_between_two_levels_are_said_beside_the_standard_ones():

@@ -13,7 +13,13 @@ from geosplat_jax.fit.folder import RunError
 from geosplat_jax.io.images import SceneError, encode_srgb, read_image, read_linear
 from geosplat_jax.io.views import no_views
 from geosplat_jax.report.renderer import RenderedView
-from geosplat_jax.report.shots import Cameras, Images, _stems, with_field_of_view
+from geosplat_jax.report.shots import (
+    Cameras,
+    Images,
+    _stems,
+    remove_later_frames,
+    with_field_of_view,
+)
 
 DATASET = sphere_dataset()
 CENTER = np.zeros(3)
@@ -67,6 +73,20 @@ def test_an_angle_keeps_the_shape_of_pixels_and_the_axis_of_the_lens():
     assert angle_of(zoomed_camera) == pytest.approx(60.0, abs=1e-3)
     assert zoomed_intrinsics[1, 1] / zoomed_intrinsics[0, 0] == pytest.approx(50 / 40)
     np.testing.assert_allclose(zoomed_intrinsics[:2, 2], [11, 13])
+
+
+def test_a_shorter_turntable_removes_the_frames_of_a_longer_one(tmp_path):
+    longer_shots = Cameras("train", turntable=3).shots(DATASET, np.zeros(3))
+    for name in [f"{shot.name}_rgba.png" for shot in longer_shots] + ["turntable_notes.txt"]:
+        (tmp_path / name).write_text("a picture")
+    remove_later_frames(tmp_path, Cameras("train").shots(DATASET, np.zeros(3)))
+    assert len(list(tmp_path.iterdir())) == 4
+    remove_later_frames(tmp_path, Cameras("train", turntable=2).shots(DATASET, np.zeros(3)))
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "turntable_0000_rgba.png",
+        "turntable_0001_rgba.png",
+        "turntable_notes.txt",
+    ]
 
 
 def test_a_turntable_is_a_circle_around_the_object_that_begins_at_the_first_camera():

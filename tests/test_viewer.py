@@ -300,6 +300,7 @@ def test_lights_come_from_files_and_folders(tmp_path):
     for name, value in (("b.hdr", 1.0), ("a.hdr", 0.5)):
         write_hdr(tmp_path / name, np.full((4, 8, 3), value, np.float32))
     (tmp_path / "notes.txt").write_text("no light")
+    (tmp_path / "._a.hdr").write_text("what macOS writes beside a file")
     files = light_files([tmp_path])
     assert [path.name for path in files] == ["a.hdr", "b.hdr"]
     lights = load_lights(files, {"b": tmp_path / "a.hdr"})

@@ -213,7 +213,7 @@ class RunFolder:
         """
         record, cameras = self._record(), self.path / CAMERAS
         if record["dataset"].get("cameras") is not None and cameras.exists():
-            record["dataset"]["cameras"] = str(cameras)
+            record["dataset"]["cameras"] = str(cameras.resolve())
         return record
 
     def _record(self) -> dict[str, Any]:

@@ -98,7 +98,8 @@ def figure(key: str) -> Figure:
 def _rendition(rendition: Rendition | ObjectRendition) -> str:
     """Say how pictures are compared."""
     if isinstance(rendition, ObjectRendition):
-        return "on the object alone, each channel of each image scaled by least squares"
+        scale = "each channel of each image scaled by least squares"
+        return f"on the object alone, {scale if rendition.is_scaled else 'without a scale'}"
     encodings = {"linear": "in linear light", "srgb": "in sRGB", "gamma22": "after gamma 2.2"}
     grey = {0.0: "black", 1.0: "white"}.get(rendition.background, f"grey {rendition.background:g}")
     channels = ", by the mean PSNR of the channels" if rendition.is_by_channel else ""
@@ -109,8 +110,12 @@ def protocol_text(name: str) -> str:
     """Say in sentences what a protocol compares, and how."""
     rules: Protocol = protocol(name)
     scale = {"least_squares": "least squares", "median": "the median of ratios"}
+    benchmark = ""
+    if rules.new_views is not None:
+        names = [_MEASURES[figure.name][0] for figure in rules.new_views.figures]
+        benchmark = f" (and, for {' and '.join(names)}, {_rendition(rules.new_views)})"
     return (
-        f"Protocol {rules.name}. New views are compared {_rendition(NEW_VIEWS)}, albedo "
+        f"Protocol {rules.name}. New views are compared {_rendition(NEW_VIEWS)}{benchmark}, albedo "
         f"{_rendition(rules.albedo)} after one factor for each channel by "
         f"{scale[rules.albedo_scale]}, relit images {_rendition(rules.relight)} with the albedo "
         "in that scale. Figures of other protocols are not comparable."
@@ -183,16 +188,26 @@ def _level_of(config: Config) -> str:
     return "standard" if config.quality == BETWEEN else config.quality
 
 
-def _preset_of(config: Config, overrides: Sequence[str] = ()) -> Config:
-    """Return the preset of ``config`` at its level, with the labels of ``config``.
+def _compared_with(config: Config) -> tuple[str, str, str | None]:
+    """Return preset, quality level and material prior (or None) that settings are compared with.
 
-    Labels are free texts in Python; in place of unknown ones the defaults are compared with.
+    Labels are free texts in Python; in place of unknown ones stand the defaults.
     """
-    geometry, level = config.geometry, _level_of(config)
-    preset = make_config(
+    level = _level_of(config)
+    return (
         config.preset if config.preset in PRESETS else PRESETS[0],
         level if level in QUALITIES else "standard",
-        material_prior=config.material_prior if config.material_prior in MATERIAL_PRIORS else None,
+        config.material_prior if config.material_prior in MATERIAL_PRIORS else None,
+    )
+
+
+def _preset_of(config: Config, overrides: Sequence[str] = ()) -> Config:
+    """Return the preset that ``config`` is compared with, with the labels of ``config``."""
+    geometry, (name, level, prior) = config.geometry, _compared_with(config)
+    preset = make_config(
+        name,
+        level,
+        material_prior=prior,
         mesh=geometry if isinstance(geometry, MeshSettings) else None,
         overrides=tuple(overrides),
     )
@@ -222,8 +237,9 @@ def command(record: Mapping[str, Any], config: Config) -> tuple[str, bool]:
     config : the settings in it.
     """
     words = ["geosplat-jax", "train", str(record["scene"]), "--output", "runs/again"]
-    words += ["--preset", config.preset, "--quality", _level_of(config)]
-    words += ["--material-prior", config.material_prior]
+    preset, level, prior = _compared_with(config)
+    words += ["--preset", preset, "--quality", level]
+    words += ["--material-prior", prior] if prior is not None else []
     if isinstance(config.geometry, MeshSettings):
         words += ["--mesh", config.geometry.path]
     reading = record["dataset"]

@@ -129,6 +129,12 @@ def _behind(camera: Camera, light: EnvLight) -> np.ndarray:
     return np.asarray(colors).reshape(camera.height, camera.width, 3)
 
 
+def _require_background(background: str) -> None:
+    """Refuse what is none of `BACKGROUNDS`; `ValueError`."""
+    if background not in BACKGROUNDS:
+        raise ValueError(f"background must be one of {BACKGROUNDS}, got {background!r}")
+
+
 def picture(view: RenderedView, camera: Camera, light: EnvLight, background: str) -> np.ndarray:
     """Composite a rendered view over a background, one of `BACKGROUNDS`; sRGB in [0, 1], (H, W, 3).
 
@@ -137,8 +143,7 @@ def picture(view: RenderedView, camera: Camera, light: EnvLight, background: str
     ValueError
         If the background is not one of `BACKGROUNDS`.
     """
-    if background not in BACKGROUNDS:
-        raise ValueError(f"background must be one of {BACKGROUNDS}, got {background!r}")
+    _require_background(background)
     if background == "light":
         backdrop = np.clip(_behind(camera, light), 0.0, 1.0)
     else:
@@ -177,8 +182,10 @@ class RelightOptions:
         Raises
         ------
         SceneError, MissingEncoderError : see `io.movies.check_movie`.
-        ValueError : a number of frames is negative or above `shots.MOST_FRAMES`.
+        ValueError : a number of frames is negative or above `shots.MOST_FRAMES`, or the background
+            is not one of `BACKGROUNDS`.
         """
+        _require_background(self.background)
         require_frames("a turntable", self.turntable)
         require_frames("a turn of the light", self.rotate_env)
         if self.turntable or self.rotate_env:

@@ -1,6 +1,7 @@
 """Which cameras to render from, and what to write of each image."""
 
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -28,6 +29,10 @@ LARGEST_SIZE = 8192
 
 MOST_FRAMES = 10_000
 """Most pictures of a turntable, or of a turn of the light."""
+
+
+_FRAME = re.compile(r"turntable_\d{4,}(?=_|$)")
+"""Name of a frame of a turntable, or its part of the name of a file."""
 
 
 class Shot(NamedTuple):
@@ -206,6 +211,17 @@ class Cameras:
         if self.field_of_view is not None:
             camera = with_field_of_view(camera, self.field_of_view)
         return camera if self.size is None else resized(camera, self.size)
+
+
+def remove_later_frames(folder: Path, shots: Sequence[Shot]) -> None:
+    """Remove the frames that an earlier, longer turntable left, which a film would show as well."""
+    names = {shot.name for shot in shots}
+    if not any(_FRAME.fullmatch(name) for name in names):
+        return
+    for path in folder.glob("turntable_*"):
+        frame = _FRAME.match(path.name)
+        if frame is not None and frame[0] not in names:
+            path.unlink()
 
 
 @dataclass(frozen=True)

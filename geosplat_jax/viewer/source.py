@@ -85,7 +85,11 @@ def light_files(paths: Iterable[Path]) -> list[Path]:
         if not path.is_dir():
             files.append(path)
             continue
-        light_maps = sorted(p for p in path.iterdir() if p.suffix.lower() in _LIGHT_SUFFIXES)
+        light_maps = sorted(
+            p
+            for p in path.iterdir()
+            if p.suffix.lower() in _LIGHT_SUFFIXES and not p.name.startswith(".")
+        )
         if not light_maps:
             raise SceneError(f"{path} holds no environment map (.hdr or .exr)")
         files += light_maps
