@@ -263,7 +263,8 @@ def knob_tables(sweep: dict[str, Any], repeated: list[dict[str, dict[str, Point]
 
     Decibels per second are the change of the quality over that of the seconds: the gain by a
     further second if both are positive, the loss by a second less if both are negative. If their
-    signs differ, the cell says in words which run is better and which is cheaper.
+    signs differ, the cell says in words which run is better and which is cheaper. Runs that were
+    trained on no scene have no row; below the front they are named.
     """
     base, figures = sweep["runs"][0]["name"], quality_figures(sweep)
     names, lines = sweep["figures"], []
@@ -274,9 +275,12 @@ def knob_tables(sweep: dict[str, Any], repeated: list[dict[str, dict[str, Point]
         members = [r for r in sweep["runs"] if r["x"] is not None and r["group"] == group]
         for run in sorted(members, key=lambda run: run["x"]):
             pairs = _pairs(repeated, run["name"], base)
+            if not any(pairs):
+                continue
             row = _knob_row(pairs, names, figures, count)
             rows.append([f"{run['x']:g} ({run['name']})", *row])
-        lines += [f"### {group}", "", *report._table(rows), ""]
+        if len(rows) > 1:
+            lines += [f"### {group}", "", *report._table(rows), ""]
     return lines
 
 

@@ -44,7 +44,8 @@ class Following(NamedTuple):
 class SurfaceModel(eqx.Module):
     """A representation of a surface, which turns learned parameters into a mesh.
 
-    These parameters are called its *shape*; they are a pytree of any structure.
+    These parameters (`Params.geometry`) are called its *shape*, not to be confused with
+    `Grid.shape`; they are a pytree of any structure.
     """
 
     @property
