@@ -26,7 +26,7 @@ from geosplat_jax.adapter import (
     with_inert_padding,
 )
 from geosplat_jax.core.mesh import closest_on_faces, face_normals_and_areas
-from geosplat_jax.core.numerics import safe_log, safe_normalize
+from geosplat_jax.core.numerics import safe_log, safe_logit, safe_normalize
 from geosplat_jax.core.settings import Share, settings
 from geosplat_jax.core.types import RATE_GROUP, Box, Splats, learned
 from geosplat_jax.materials import Attributes
@@ -93,7 +93,7 @@ def free(splats: Splats, attributes: Attributes, box: Box) -> FreeSplatParameter
         log_scales=safe_log(splats.scales / box.half_extent),
         quats=splats.quats,
         normals=splats.normals,
-        opacity_logits=safe_log(opacities) - jnp.log1p(-opacities),
+        opacity_logits=safe_logit(opacities),
         albedo=attributes.materials.albedo,
         indirect=attributes.indirect,
     )

@@ -14,6 +14,7 @@ from geosplat_jax.core.numerics import (
     fast_arctan2,
     safe_divide,
     safe_log,
+    safe_logit,
     safe_norm,
     safe_normalize,
     safe_power,
@@ -38,6 +39,14 @@ def test_norm_and_its_gradient_are_exact_over_40_decades():
     np.testing.assert_allclose(safe_norm(x32), 10.0**DECADES, rtol=RELATIVE)
     gradient = jax.grad(lambda v: jnp.sum(safe_norm(v)))(x32)
     np.testing.assert_allclose(gradient, unit, atol=RELATIVE)
+
+
+def test_logit_inverts_the_logistic_function_and_is_finite_at_zero():
+    logits = jnp.asarray([-40.0, -5.0, 0.0, 3.0, 9.0], jnp.float32)
+    np.testing.assert_allclose(safe_logit(jax.nn.sigmoid(logits)), logits, rtol=1e-4, atol=1e-6)
+    value, slope = jax.value_and_grad(safe_logit)(jnp.asarray(0.0, jnp.float32))
+    assert np.isfinite(value)
+    assert np.isfinite(slope)
 
 
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])

@@ -328,7 +328,7 @@ def test_the_first_stage_of_another_run_can_be_taken_over_bit_for_bit(
 def test_a_stage_with_other_settings_does_not_take_over_the_plan_of_its_buffers(
     dataset, whole, tmp_path
 ):
-    transport = "stages.monte_carlo.transport.kind=split_sum"
+    transport = "stages.monte_carlo.transport.occlusion=false"
     first_folder, later_folder = tmp_path / "first", tmp_path / "later"
     begin = TakeOver(whole[0], "monte_carlo")
     fit(dataset, tiny_config(*RUN, transport), first_folder, begin=begin)

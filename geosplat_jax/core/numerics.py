@@ -86,6 +86,14 @@ def safe_log(x: Float[Array, "..."], *, smallest: float = LENGTH_EPSILON) -> Flo
     return jnp.log(jnp.where(x <= smallest, smallest, x))
 
 
+def safe_logit(p: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Inverse of the logistic function, ``log(p / (1 - p))``, for p in [0, 1).
+
+    At least that of `LENGTH_EPSILON`, below which the gradient is zero. Infinite at 1.
+    """
+    return safe_log(p) - jnp.log1p(-p)
+
+
 def safe_norm(
     x: Float[Array, "..."], *, axis: int = -1, keepdims: bool = False
 ) -> Float[Array, "..."]:

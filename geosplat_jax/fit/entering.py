@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
 from geosplat_jax.adapter import SplatSettings
+from geosplat_jax.core.numerics import safe_logit
 from geosplat_jax.core.settings import Variant, settings
 from geosplat_jax.core.types import Splats
 from geosplat_jax.hashgrid import Layer
@@ -134,8 +135,7 @@ def _one_colour(head: tuple[Layer, ...], albedo: Float[Array, " 3"]) -> tuple[La
     """Return the albedo head with a last layer that gives one colour everywhere."""
     *hidden_layers, last_layer = head
     albedo = albedo.astype(last_layer.weights.dtype)
-    logits = jnp.log(albedo) - jnp.log1p(-albedo)
-    return (*hidden_layers, Layer(jnp.zeros_like(last_layer.weights), logits))
+    return (*hidden_layers, Layer(jnp.zeros_like(last_layer.weights), safe_logit(albedo)))
 
 
 def enter_stage(

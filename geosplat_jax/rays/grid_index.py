@@ -12,10 +12,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from geosplat_jax.core.capacity import Capacities, Usage, bit_set, usage
+from geosplat_jax.core.components import cross, dot
 from geosplat_jax.core.numerics import safe_normalize
 from geosplat_jax.core.types import Grid, Mesh
 from geosplat_jax.rays.cells import SLACK, WORD_BITS, cell_lists, cones_of, words_of
-from geosplat_jax.rays.walking import T_MIN, CellIndex, Lanes, cross, dot
+from geosplat_jax.rays.walking import T_MIN, CellIndex, Lanes
 
 _COUNT_BITS = 8
 """Bits for the number of patches that a cell lists. It is at most 144: a patch belongs to a grid

@@ -17,10 +17,11 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from geosplat_jax.core.capacity import Capacities, Usage, bit_set, usage
+from geosplat_jax.core.components import cross, dot
 from geosplat_jax.core.numerics import safe_normalize
 from geosplat_jax.core.types import Grid
 from geosplat_jax.rays.cells import SLACK, WORD_BITS, cell_lists, cones_of, words_of
-from geosplat_jax.rays.walking import T_MIN, CellIndex, Lanes, cross, dot
+from geosplat_jax.rays.walking import T_MIN, CellIndex, Lanes
 
 _TESTED_AT_ONCE = 2
 """Triangles of a cell that a ray is tested against before it may move on."""

@@ -142,16 +142,6 @@ class CellIndex(RayIndex):
         return _nearest(self, origins, directions, source, mask, two_sided=two_sided)
 
 
-def cross(a: tuple[Array, ...], b: tuple[Array, ...]) -> tuple[Array, ...]:
-    """Cross product of vectors whose components are arrays of their own."""
-    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
-
-
-def dot(a: tuple[Array, ...], b: tuple[Array, ...]) -> Array:
-    """Scalar product of vectors whose components are arrays of their own."""
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
 def _enter(
     lanes: Lanes, cell: tuple[Array, ...], index: CellIndex, two_sided: bool
 ) -> Int[Array, " n"]:

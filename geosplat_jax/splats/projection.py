@@ -10,13 +10,11 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from geosplat_jax.core.components import Components, cross, dot
 from geosplat_jax.core.numerics import safe_normalize, safe_sqrt
 
 LOW_PASS_VARIANCE = 0.3
 """Variance of the screen-space low-pass filter, square pixels."""
-
-Columns = list[Float[Array, " N"]]
-"""Components of N vectors, one array each: XLA fuses and vectorises these, not (N, 3) rows."""
 
 _FIELD_OF_VIEW_MARGIN = 0.3
 """Largest distance from the image at which the Jacobian is evaluated, as a share of half the size
@@ -53,30 +51,18 @@ def _jacobian_slopes(
     return jnp.clip(slope, -center / focal - margin, (size - center) / focal + margin)
 
 
-def _dot(a: Columns, b: Columns) -> Float[Array, " N"]:
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-def _cross(a: Columns, b: Columns) -> Columns:
-    return [
-        a[1] * b[2] - a[2] * b[1],
-        a[2] * b[0] - a[0] * b[2],
-        a[0] * b[1] - a[1] * b[0],
-    ]
-
-
-def _unit_columns(quats: Float[Array, "N 4"]) -> Columns:
+def _unit_components(quats: Float[Array, "N 4"]) -> Components:
     """Components w, x, y, z of the normalised quaternions; the identity for a zero one."""
     unit = safe_normalize(quats)
     is_zero = jnp.all(unit == 0, axis=-1)
     return [jnp.where(is_zero, 1.0 if i == 0 else 0.0, unit[:, i]) for i in range(4)]
 
 
-def _rotate_back(unit: Columns, vector: Columns) -> Columns:
+def _rotate_back(unit: Components, vector: Components) -> Components:
     """Apply the transposed rotation of unit quaternions: ``v - 2 w (q x v) + 2 q x (q x v)``."""
     w, axis = unit[0], unit[1:]
-    first_cross = _cross(axis, vector)
-    second_cross = _cross(axis, first_cross)
+    first_cross = cross(axis, vector)
+    second_cross = cross(axis, first_cross)
     return [
         v + 2.0 * (b - w * a) for v, a, b in zip(vector, first_cross, second_cross, strict=True)
     ]
@@ -126,14 +112,14 @@ def project(
     clamped_y = _jacobian_slopes(slope_y, fy, cy, height)
     image_x = [fx * inverse_depth * (rotation[0, i] - clamped_x * rotation[2, i]) for i in range(3)]
     image_y = [fy * inverse_depth * (rotation[1, i] - clamped_y * rotation[2, i]) for i in range(3)]
-    unit = _unit_columns(quats)
+    unit = _unit_components(quats)
     row_x = [scales[:, i] * c for i, c in enumerate(_rotate_back(unit, image_x))]
     row_y = [scales[:, i] * c for i, c in enumerate(_rotate_back(unit, image_y))]
 
-    sharp_xx, xy, sharp_yy = _dot(row_x, row_x), _dot(row_x, row_y), _dot(row_y, row_y)
+    sharp_xx, xy, sharp_yy = dot(row_x, row_x), dot(row_x, row_y), dot(row_y, row_y)
     # Cauchy-Binet: det(rows rows^T) = |row_x x row_y|^2, never negative and free of cancellation.
-    normal = _cross(row_x, row_y)
-    sharp_determinant = _dot(normal, normal)
+    normal = cross(row_x, row_y)
+    sharp_determinant = dot(normal, normal)
     blur = LOW_PASS_VARIANCE * (sharp_xx + sharp_yy) + LOW_PASS_VARIANCE**2
     inverse_determinant = 1.0 / (sharp_determinant + blur)
     xx, yy = sharp_xx + LOW_PASS_VARIANCE, sharp_yy + LOW_PASS_VARIANCE

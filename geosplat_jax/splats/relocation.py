@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from geosplat_jax.core.numerics import safe_log
+from geosplat_jax.core.numerics import safe_log, safe_logit
 from geosplat_jax.core.rotation import quaternion_to_matrix
 from geosplat_jax.splats.radiance import RadianceSplats
 
@@ -122,9 +122,7 @@ def relocate(
     factor = shared_scale_factor(old_opacities, shared_opacities, sharers)
     shared_opacities = jnp.clip(shared_opacities, DEAD_OPACITY, _HIGHEST_OPACITY)
     is_target = copies > 0.0
-    logits = jnp.where(
-        is_target, safe_log(shared_opacities) - jnp.log1p(-shared_opacities), splats.opacity_logits
-    )
+    logits = jnp.where(is_target, safe_logit(shared_opacities), splats.opacity_logits)
     log_scales = jnp.where(
         is_target[:, None], splats.log_scales + safe_log(factor)[:, None], splats.log_scales
     )

@@ -19,6 +19,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from geosplat_jax.core.color import luminance
+from geosplat_jax.core.components import Components, components, cross, dot
 from geosplat_jax.core.numerics import COSINE_EPSILON, LENGTH_EPSILON, safe_divide, safe_sqrt
 from geosplat_jax.core.rotation import frame_from_normal
 from geosplat_jax.core.types import Materials
@@ -37,20 +38,8 @@ _LOBE_PROBABILITY_FLOOR = 0.1
 """Least share of samples for the specular lobe, which bounds the weight of any sample in it."""
 
 
-Components = tuple[Array, ...]
-"""The x, y and z of vectors, each an array of its own."""
-
-
-def _dot(first: Float[Array, "N 3"], second: Float[Array, "N 3"]) -> Float[Array, " N"]:
+def _row_dot(first: Float[Array, "N 3"], second: Float[Array, "N 3"]) -> Float[Array, " N"]:
     return jnp.sum(first * second, axis=-1)
-
-
-def _components(vectors: Float[Array, "N 3"]) -> Components:
-    return vectors[:, 0], vectors[:, 1], vectors[:, 2]
-
-
-def _along(first: Components, second: Components) -> Array:
-    return first[0] * second[0] + first[1] * second[1] + first[2] * second[2]
 
 
 def ggx_alpha(roughness: Float[Array, "..."]) -> Float[Array, "..."]:
@@ -74,10 +63,8 @@ def schlick(f0: Float[Array, "N 3"], cosine: Float[Array, " N"]) -> Float[Array,
 
 def _cross_squared(first: Components, second: Components) -> Array:
     """Squared length of a cross product."""
-    x = first[1] * second[2] - first[2] * second[1]
-    y = first[2] * second[0] - first[0] * second[2]
-    z = first[0] * second[1] - first[1] * second[0]
-    return x * x + y * y + z * z
+    product = cross(first, second)
+    return dot(product, product)
 
 
 def _distribution(cosine: Array, sine_squared: Array, alpha: Array) -> Array:
@@ -97,8 +84,8 @@ def ggx_distribution(
     ``alpha^2 / (pi (cos^2 alpha^2 + sin^2)^2)``, with the sine from the cross product: the usual
     ``cos^2 (alpha^2 - 1) + 1`` loses all digits at the peak of a smooth surface in float32.
     """
-    sine_squared = _cross_squared(_components(half), _components(normals))
-    return _distribution(_dot(half, normals), sine_squared, alpha)
+    sine_squared = _cross_squared(components(half), components(normals))
+    return _distribution(_row_dot(half, normals), sine_squared, alpha)
 
 
 def _smith_root(cosine: Float[Array, "..."], alpha: Float[Array, "..."]) -> Float[Array, "..."]:
@@ -146,14 +133,14 @@ def specular_lobe(normals: Components, wi: Components, wo: Components, alpha: Ar
     normals, wi, wo : unit vectors, world.
     alpha : width of the GGX distribution, from `ggx_alpha`.
     """
-    cosine_i, cosine_o = _along(normals, wi), _along(normals, wo)
+    cosine_i, cosine_o = dot(normals, wi), dot(normals, wo)
     is_above = (cosine_i > 0) & (cosine_o > 0)
     floored_i = jnp.maximum(cosine_i, COSINE_EPSILON)
     floored_o = jnp.maximum(cosine_o, COSINE_EPSILON)
     half_vector = tuple(a + b for a, b in zip(wi, wo, strict=True))
-    length = safe_sqrt(_along(half_vector, half_vector))
+    length = safe_sqrt(dot(half_vector, half_vector))
     inverse = safe_divide(jnp.ones_like(length), length, smallest=_OPPOSITE)
-    cosine_h = _along(normals, half_vector) * inverse
+    cosine_h = dot(normals, half_vector) * inverse
     sine_squared = _cross_squared(half_vector, normals) * jnp.square(inverse)
     distribution = _distribution(cosine_h, sine_squared, alpha)
     strength = distribution * smith_visibility(floored_i, floored_o, alpha)
@@ -180,11 +167,11 @@ def evaluate_lobes(
 ) -> tuple[Float[Array, "N 3"], Float[Array, "N 3"]]:
     """Diffuse and specular reflectance per solid angle, without the cosine; see `evaluate`."""
     if not materials.has_specular:
-        is_above = (_dot(normals, wi) > 0) & (_dot(normals, wo) > 0)
+        is_above = (_row_dot(normals, wi) > 0) & (_row_dot(normals, wo) > 0)
         diffuse = jnp.where(is_above[:, None], materials.albedo * (1 / math.pi), 0.0)
         return diffuse, jnp.zeros_like(diffuse)
     alpha = ggx_alpha(materials.roughness)
-    lobe = specular_lobe(_components(normals), _components(wi), _components(wo), alpha)
+    lobe = specular_lobe(components(normals), components(wi), components(wo), alpha)
     f0 = specular_f0(materials.albedo, materials.metallic)
     fresnel = f0 + (1 - f0) * lobe.grazing[:, None]
     base = jnp.where(lobe.is_above, jnp.asarray(1 / math.pi, fresnel.dtype), 0.0)
@@ -220,7 +207,7 @@ def specular_probability(
 ) -> Float[Array, " N"]:
     """Share of samples for the specular lobe, from both lobes' luminance at this view."""
     f0 = specular_f0(materials.albedo, materials.metallic)
-    specular = luminance(schlick(f0, _dot(normals, wo)))
+    specular = luminance(schlick(f0, _row_dot(normals, wo)))
     diffuse = luminance(materials.albedo) * (1 - materials.metallic)
     share = safe_divide(specular, specular + diffuse, otherwise=1.0)
     return jnp.maximum(share, _LOBE_PROBABILITY_FLOOR)
@@ -228,7 +215,7 @@ def specular_probability(
 
 def cosine_pdf(normals: Float[Array, "N 3"], wi: Float[Array, "N 3"]) -> Float[Array, " N"]:
     """Density per solid angle of `sample_cosine`: cosine / pi above the surface."""
-    return jnp.maximum(_dot(normals, wi), 0.0) / math.pi
+    return jnp.maximum(_row_dot(normals, wi), 0.0) / math.pi
 
 
 def specular_pdf(
@@ -242,7 +229,7 @@ def specular_pdf(
     It integrates to one over the whole sphere: visible normals seen at a slant reflect some
     samples below the surface, where `evaluate` is zero.
     """
-    vectors = (_components(normals), _components(wi), _components(wo))
+    vectors = (components(normals), components(wi), components(wo))
     return specular_lobe(*vectors, ggx_alpha(roughness)).density
 
 
@@ -262,7 +249,7 @@ def pdf(
 
 def _unit(vectors: Components) -> Components:
     """Scale vectors of about unit length to exactly that."""
-    inverse = jax.lax.rsqrt(jnp.maximum(_along(vectors, vectors), LENGTH_EPSILON))
+    inverse = jax.lax.rsqrt(jnp.maximum(dot(vectors, vectors), LENGTH_EPSILON))
     return tuple(component * inverse for component in vectors)
 
 
@@ -301,8 +288,8 @@ def specular_directions(
     """
     alpha, normals, wo = jax.lax.stop_gradient((alpha, normals, wo))
     tangent, bitangent = _frame(normals)
-    cosine = jnp.maximum(_along(wo, normals), 0.0)
-    local = (_along(wo, tangent), _along(wo, bitangent), cosine)
+    cosine = jnp.maximum(dot(wo, normals), 0.0)
+    local = (dot(wo, tangent), dot(wo, bitangent), cosine)
     view = _unit((alpha * local[0], alpha * local[1], cosine))
     azimuth = 2 * math.pi * first
     # A uniform point of the spherical cap that a mirror hemisphere reflects the view into.
@@ -310,7 +297,7 @@ def specular_directions(
     radius = safe_sqrt(1 - z * z)
     cap = (radius * jnp.cos(azimuth) + view[0], radius * jnp.sin(azimuth) + view[1], z + view[2])
     half = jax.lax.optimization_barrier(_unit((alpha * cap[0], alpha * cap[1], cap[2])))
-    twice_cosine = 2 * _along(local, half)
+    twice_cosine = 2 * dot(local, half)
     mirrored = tuple(twice_cosine * h - v for h, v in zip(half, local, strict=True))
     return jax.lax.stop_gradient(_to_world(mirrored, (tangent, bitangent, normals)))
 
@@ -319,7 +306,7 @@ def sample_cosine(
     normals: Float[Array, "N 3"], uniforms: Float[Array, "N 2"]
 ) -> Float[Array, "N 3"]:
     """Draw unit directions with density `cosine_pdf` about unit normals; no gradients."""
-    directions = cosine_directions(_components(normals), uniforms[:, 0], uniforms[:, 1])
+    directions = cosine_directions(components(normals), uniforms[:, 0], uniforms[:, 1])
     return jnp.stack(directions, axis=-1)
 
 
@@ -330,7 +317,7 @@ def sample_specular(
     uniforms: Float[Array, "N 2"],
 ) -> Float[Array, "N 3"]:
     """Mirror the view at a visible microfacet normal: density `specular_pdf`; no gradients."""
-    vectors = (_components(normals), _components(wo))
+    vectors = (components(normals), components(wo))
     numbers = (uniforms[:, 0], uniforms[:, 1])
     return jnp.stack(specular_directions(ggx_alpha(roughness), *vectors, *numbers), axis=-1)
 
