@@ -1,8 +1,7 @@
 """Time the isosurface, forward and with gradients, on a torus at two resolutions.
 
 The function is that of the reference measurement: the sum of volume, a moment of the triangle
-areas, and the deviation regulariser. PyTorch FlexiCubes takes 203 ms (R=48) and 956 ms (R=96) for
-it on two idle cores of the machine whose calibration is ``exp_ms`` = 6.
+areas, and the deviation regulariser. The README has the times of FlexiCubes in PyTorch for it.
 """
 
 import json
@@ -20,7 +19,6 @@ from geosplat_jax.geometry import isosurface
 from geosplat_jax.surface.grids import grid_vertices, initial_geometry, sdf_entropy
 
 RESOLUTIONS = (48, 96)
-YARDSTICK_MS = {48: 203.0, 96: 956.0}
 
 
 def torus(resolution: int) -> tuple[Geometry, Grid]:

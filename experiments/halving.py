@@ -130,7 +130,7 @@ def full_costs(folder: Path, sweep: Sweep, factor: float) -> dict[str, tuple[flo
     Both are means over the scenes; runs that are not complete on all scenes are left out. Seconds
     follow from median steps, without compilation, which does not grow with the number of steps.
     """
-    record = trade.report._read_sweep(folder)
+    record = trade.report.read_record(folder)
     figures = trade.quality_figures(record)
     values = {}
     for name, scenes in trade.read_points(folder, record).items():
@@ -181,7 +181,7 @@ def search(
         # The base stays, since all is compared with it.
         names = list(dict.fromkeys([candidates[0].name, *survivor_names]))
         candidates = [run for run in candidates if run.name in names]
-        runner._say(f"rung {rung}: {len(candidates)} go on: {', '.join(names)}")
+        runner.say(f"rung {rung}: {len(candidates)} go on: {', '.join(names)}")
     raise AssertionError("the last rung trains in full")
 
 
@@ -210,21 +210,21 @@ def main(
         )
         do_jobs = runner.jobs_runner(arguments, start=start)
         last_sweep, folder, failures = search(sweep, arguments, do_jobs)
-        record = trade.report._read_sweep(folder)
+        record = trade.report.read_record(folder)
         text = trade.compose(record, [trade.read_points(folder, record)])
     except (SweepError, ReportError, OSError) as error:
-        runner._say(f"error: {error}")
+        runner.say(f"error: {error}")
         return 2
     except KeyboardInterrupt:
-        runner._say("interrupted; the same command goes on from the last checkpoint")
+        runner.say("interrupted; the same command goes on from the last checkpoint")
         return 130
     finally:
         signal.signal(signal.SIGTERM, previous_handler)
     (arguments.output / "front.md").write_text(text, encoding="utf-8")
-    runner._say(f"front of {len(last_sweep.runs)} runs: {arguments.output / 'front.md'}")
+    runner.say(f"front of {len(last_sweep.runs)} runs: {arguments.output / 'front.md'}")
     if failures:
         labels = ", ".join(job.label for job in failures)
-        runner._say(f"{len(failures)} of the last rung failed, and are not compared: {labels}")
+        runner.say(f"{len(failures)} of the last rung failed, and are not compared: {labels}")
         return 1
     return 0
 

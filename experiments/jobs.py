@@ -71,7 +71,7 @@ def shared_stages(config: Config, others: Iterable[Config]) -> Config | None:
 
 
 def _begins(prefix: Config, config: Config) -> bool:
-    """Whether the run of ``config`` starts with all stages of ``first``."""
+    """Whether a run with settings ``config`` starts with all stages of ``prefix``."""
     count = len(prefix.active_stages)
     return beginning(config, count) == beginning(prefix, count)
 

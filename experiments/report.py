@@ -234,7 +234,7 @@ def read_entries(folder: Path, sweep: dict[str, Any]) -> dict[str, dict[str, Ent
     }
 
 
-def _table(rows: list[list[str]]) -> list[str]:
+def markdown_table(rows: list[list[str]]) -> list[str]:
     """Lay out a markdown table; the first row is the header, the first column holds names."""
     header, *body = [[_cell(cell) for cell in row] for row in rows]
     rule = ["---", *["---:"] * (len(header) - 1)]
@@ -259,7 +259,7 @@ def scene_table(sweep: dict[str, Any], entries: dict[str, Entry]) -> list[str]:
             for cost in costs
         ]
         rows.append(row)
-    return _table(rows)
+    return markdown_table(rows)
 
 
 def _pairs(
@@ -309,7 +309,7 @@ def summary_table(sweep: dict[str, Any], entries: dict[str, dict[str, Entry]]) -
                 cell += f" ({len(pairs)} of {reference_count} scenes)"
             row.append(cell)
         rows.append(row)
-    return _table(rows)
+    return markdown_table(rows)
 
 
 def seed_table(sweep: dict[str, Any], repeated: list[dict[str, dict[str, Entry]]]) -> list[str]:
@@ -333,7 +333,7 @@ def seed_table(sweep: dict[str, Any], repeated: list[dict[str, dict[str, Entry]]
                     values.append(statistics.fmean(a - reference_weight * b for a, b in pairs))
             row.append(_with_spread(figure, values, signed=name != reference))
         rows.append(row)
-    return _table(rows)
+    return markdown_table(rows)
 
 
 def _with_spread(figure: str, values: list[float], *, signed: bool) -> str:
@@ -450,7 +450,7 @@ def _describe_runs(sweep: dict[str, Any]) -> list[str]:
             title += f" (evaluated with {', '.join(deviations)})"
         changes = ", ".join(f"`{override}`" for override in run["overrides"])
         rows.append([run["name"], title, changes or _NONE])
-    lines = _table(rows)
+    lines = markdown_table(rows)
     lines[1] = "| --- | --- | --- |"
     common_settings = ", ".join(f"`{override}`" for override in sweep["overrides"])
     reduced = sweep["downscale"] > 1
@@ -539,7 +539,7 @@ def compose(
     return "\n".join(lines)
 
 
-def _read_sweep(folder: Path) -> dict[str, Any]:
+def read_record(folder: Path) -> dict[str, Any]:
     """Read ``sweep.json`` of a folder of experiments/run.py; `ReportError` if it cannot be read."""
     try:
         sweep = json.loads((folder / "sweep.json").read_text())
@@ -552,13 +552,13 @@ def _read_sweep(folder: Path) -> dict[str, Any]:
     return sweep
 
 
-def _read_repetitions(
+def read_repetitions(
     sweep: dict[str, Any], folders: list[Path]
 ) -> list[dict[str, dict[str, Entry]]]:
     """Read the entries of sweeps that differ from this one in their seeds alone."""
     repetitions, seeds = [], {sweep["runs"][0]["config"]["run"]["seed"]}
     for folder in folders:
-        repetition = _read_sweep(folder)
+        repetition = read_record(folder)
         matches = [
             all(run.get(key) == repeated_run.get(key) for key in ("name", "evaluate", "downscale"))
             and [line.split(":")[0] for line in _differences(run, repeated_run)] == ["run.seed"]
@@ -600,8 +600,8 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--plots", type=Path, help="folder for curves (default: none are drawn)")
     arguments = parser.parse_args(argv)
     try:
-        sweep = _read_sweep(arguments.folder)
-        repetitions = _read_repetitions(sweep, arguments.seeds)
+        sweep = read_record(arguments.folder)
+        repetitions = read_repetitions(sweep, arguments.seeds)
     except ReportError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

@@ -159,7 +159,7 @@ def execute(
     (folder / "error.txt").unlink(missing_ok=True)
 
 
-def _say(text: str) -> None:
+def say(text: str) -> None:
     """Report progress."""
     print(text, file=sys.stderr, flush=True)
 
@@ -196,7 +196,7 @@ def in_a_process(job: Job) -> None:
         def forward() -> None:
             for line in child.stdout or ():
                 last_lines.append(line)
-                _say(f"  {line.rstrip()}")
+                say(f"  {line.rstrip()}")
 
         try:
             forward()
@@ -221,7 +221,7 @@ def _note_failure(job: Job, text: str) -> None:
     folder = Path(job.folder)
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "error.txt").write_text(text.rstrip() + "\n")
-    _say(f"{job.label} failed; see {folder / 'error.txt'}")
+    say(f"{job.label} failed; see {folder / 'error.txt'}")
 
 
 def run_jobs(jobs: list[Job], *, start: Callable[[Job], None] = in_a_process) -> list[Job]:
@@ -234,7 +234,7 @@ def run_jobs(jobs: list[Job], *, start: Callable[[Job], None] = in_a_process) ->
     for number, job in enumerate(jobs, 1):
         prefix = f"[{number}/{len(jobs)}] {job.label}"
         if is_finished(job):
-            _say(f"{prefix}: finished already")
+            say(f"{prefix}: finished already")
             (Path(job.folder) / "error.txt").unlink(missing_ok=True)
             continue
         source = next((failure for failure in failures if failure.folder == job.source), None)
@@ -243,7 +243,7 @@ def run_jobs(jobs: list[Job], *, start: Callable[[Job], None] = in_a_process) ->
             _note_failure(job, f"the stages to take over failed; see ../{name}/error.txt")
             failures.append(job)
             continue
-        _say(f"{prefix}: {'evaluating' if is_trained(job) else 'training'}")
+        say(f"{prefix}: {'evaluating' if is_trained(job) else 'training'}")
         (Path(job.folder) / "error.txt").unlink(missing_ok=True)
         try:
             start(job)
@@ -335,7 +335,7 @@ def run_on_cluster(jobs: list[Job], executor: Any, *, parallel: int) -> list[Job
                 prefix = f"[{len(jobs) - len(pending_jobs)}/{len(jobs)}] {job.label}"
                 (Path(job.folder) / "error.txt").unlink(missing_ok=True)
                 if state == "finished":
-                    _say(f"{prefix}: finished already")
+                    say(f"{prefix}: finished already")
                 elif state == "lost":
                     name = Path(job.source or "").name
                     _note_failure(job, f"the stages to take over failed; see ../{name}/error.txt")
@@ -343,14 +343,14 @@ def run_on_cluster(jobs: list[Job], executor: Any, *, parallel: int) -> list[Job
                 else:
                     cluster_job = cluster.submit(executor, command_of(job))
                     running_jobs[job.label] = (job, cluster_job)
-                    _say(f"{prefix}: submitted as {cluster_job.job_id}")
+                    say(f"{prefix}: submitted as {cluster_job.job_id}")
             for label, (job, cluster_job) in list(running_jobs.items()):
                 if not cluster_job.done():
                     continue
                 del running_jobs[label]
                 error = cluster_job.exception()
                 if error is None and is_finished(job):
-                    _say(f"{label}: done")
+                    say(f"{label}: done")
                 else:
                     _note_failure(job, str(error or "it ended without its figures"))
                     failures.append(job)
@@ -459,7 +459,7 @@ def _run_one(text: str) -> int:
     try:
         execute(Job(**json.loads(text)))
     except (Interrupted, KeyboardInterrupt) as stop:
-        _say(str(stop) or "interrupted")
+        say(str(stop) or "interrupted")
         return 130
     return 0
 
@@ -488,18 +488,18 @@ def main(argv: list[str] | None = None, *, start: Callable[[Job], None] = in_a_p
         check_folders(jobs)
         write_record(sweep, arguments.scenes, arguments.output, _command_line(arguments))
     except (SweepError, OSError) as error:
-        _say(f"error: {error}")
+        say(f"error: {error}")
         return 2
     previous_handler = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         failures = do_jobs(jobs)
     except KeyboardInterrupt:
-        _say("interrupted; the same command goes on from the last checkpoint")
+        say("interrupted; the same command goes on from the last checkpoint")
         return 130
     finally:
         signal.signal(signal.SIGTERM, previous_handler)
     if failures:
-        _say(f"{len(failures)} of {len(jobs)} failed: {', '.join(job.label for job in failures)}")
+        say(f"{len(failures)} of {len(jobs)} failed: {', '.join(job.label for job in failures)}")
         return 1
     return 0
 

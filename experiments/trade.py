@@ -280,7 +280,7 @@ def knob_tables(sweep: dict[str, Any], repeated: list[dict[str, dict[str, Point]
             row = _knob_row(pairs, names, figures, count)
             rows.append([f"{run['x']:g} ({run['name']})", *row])
         if len(rows) > 1:
-            lines += [f"### {group}", "", *report._table(rows), ""]
+            lines += [f"### {group}", "", *report.markdown_table(rows), ""]
     return lines
 
 
@@ -309,7 +309,7 @@ def front_table(sweep: dict[str, Any], repeated: list[dict[str, dict[str, Point]
         costs = [f"{seconds:.0f}", f"{whole_seconds[name]:.0f}"]
         rows.append([name, *costs, f"{mean_quality:.2f}", slope, titles[name]])
         previous_point = (seconds, mean_quality)
-    lines = [*report._table(rows), ""]
+    lines = [*report.markdown_table(rows), ""]
     if incomplete_runs:
         lines += [
             f"Without figures of all scenes, hence not compared: {', '.join(incomplete_runs)}.",
@@ -356,11 +356,11 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--output", type=Path, help="markdown file (default: the terminal)")
     arguments = parser.parse_args(argv)
     try:
-        sweep = report._read_sweep(arguments.folder)
-        report._read_repetitions(sweep, arguments.seeds)
+        sweep = report.read_record(arguments.folder)
+        report.read_repetitions(sweep, arguments.seeds)
         folders = [arguments.folder, *arguments.seeds]
         text = compose(
-            sweep, [read_points(folder, report._read_sweep(folder)) for folder in folders]
+            sweep, [read_points(folder, report.read_record(folder)) for folder in folders]
         )
     except ReportError as error:
         print(f"error: {error}", file=sys.stderr)

@@ -35,7 +35,7 @@ def rounds_folder(output: str | Path) -> Path:
 
 
 def round_config(material_prior: str | None = None, *, seed: int | None = None) -> Config:
-    """Return the settings of a round: a draft with half its split sum and no refinement.
+    """Return the settings of a round: a draft of half the split-sum steps and no free splats.
 
     What rounds recover was measured with these settings (docs/cameras.md); longer rounds and free
     splats were not tried.
@@ -54,7 +54,7 @@ def round_config(material_prior: str | None = None, *, seed: int | None = None) 
     return make_config(quality="draft", material_prior=material_prior, overrides=overrides)
 
 
-def _require_same(folder: Path, provenance: Mapping[str, Any]) -> None:
+def _record_or_require_same(folder: Path, provenance: Mapping[str, Any]) -> None:
     """Record what the rounds in a folder are made with; refuse those made with something else.
 
     Raises
@@ -132,8 +132,7 @@ def refined_cameras(
     config = config or round_config()
     rounds_path, options = rounds_folder(output), dict(reading or {})
     cameras, how = Path(), how or CameraSettings()
-    dataset: Dataset | None = load_recorded(scene, options)
-    assert dataset is not None
+    dataset = load_recorded(scene, options)
     if geometry is not None:
         geometry.notes(dataset)
     provenance = {
@@ -145,18 +144,19 @@ def refined_cameras(
         "config": config.to_dict(),
         "refinement": asdict(how),
     }
-    _require_same(rounds_path, provenance)
+    _record_or_require_same(rounds_path, provenance)
     if replace:
         dataset.require_masks("train")
-        RunFolder(output).make_room(replace=True)
+        RunFolder(output).make_room()
+    current: Dataset | None = dataset  # None once a round has changed the cameras
     for number in range(1, rounds + 1):
         folder = rounds_path / f"round_{number}"
         cameras = folder.with_suffix(".json")
         if not cameras.exists():
-            if dataset is None:
-                dataset = load_recorded(scene, options)
-            run = train(dataset, folder, config, begin=Resume(), listener=listener)
+            if current is None:
+                current = load_recorded(scene, options)
+            run = train(current, folder, config, begin=Resume(), listener=listener)
             run.refine_cameras(cameras, how=how, on_view=on_view)
-        options["cameras"], dataset = cameras, None
+        options["cameras"], current = cameras, None
         options.pop("cameras_digest", None)  # of the cameras before
     return cameras

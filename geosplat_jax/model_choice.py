@@ -56,8 +56,8 @@ _BLOCKED = 0.02
 """Shadows are kept if the surface blocks more than this share of a uniform sky's light from
 itself."""
 
-_SIZES = ("shift", "hash", "light")
-"""Parts that the first stage, which all trials share, does without."""
+_LATER_PARTS = ("shift", "hash", "light")
+"""Parts that the first stages do without, which trials share."""
 
 _UNTRIED = "untried, since it changes no stage of the trials"
 
@@ -89,7 +89,7 @@ class ChosenModel:
     rungs : results of all parts that were tried, in order.
     by_hand : titles of the parts that were set by hand, and of those that these need.
     held_back : names of the views that were held back.
-    trainings : number of trainings that were measured.
+    trainings : number of trainings of models, those that failed included, first stages not.
     seconds : time that they took, first stages included.
     """
 
@@ -159,12 +159,12 @@ def choose_model(
         trials.open(begin)
         if begin.replace:
             config.geometry.notes(dataset)  # Refuses a start mesh that does not fit the scene.
-            RunFolder(output).make_room(replace=True)
+            RunFolder(output).make_room()
         for part in candidate_parts:
             if not kept_names.issuperset(_among(part.follows, candidate_parts)):
                 continue
             trial_names = kept_names | {part.name} | _among(part.needs, candidate_parts)
-            if part.is_photographed:
+            if part.shows_in_photographs:
                 rung = _tried(trials, part, kept_names, trial_names)
             else:
                 rung = _seen_on_surface(trials, part, kept_names, trial_names)
@@ -226,8 +226,8 @@ def _seen_on_surface(
 ) -> Rung:
     """Keep a part, such as shadows, if the surface blocks enough light from itself.
 
-    For parts that photographs under one light cannot judge (`Part.is_photographed`). A part that
-    would be kept is trained once, and left out if that training fails.
+    For parts that photographs under one light cannot judge (`Part.shows_in_photographs`). A part
+    that would be kept is trained once, and left out if that training fails.
     """
     smaller_mean = float(np.mean(trials.decibels(kept_names, 0)))
     share = trials.blocked_share()
@@ -261,14 +261,15 @@ class _Trials:
         stages = [stage for stage in config.active_stages if not stage.splats.takes_over]
         if not stages:
             raise ValueError("there is no model to choose: no stage has steps")
-        # On a view without the object, a single covered pixel would weigh some hundred decibels.
+        # A view without the object scores 200 dB if the render is empty, and a single covered pixel
+        # costs more than a hundred of them: such views would decide every comparison.
         shown = np.flatnonzero(dataset.train.coverage > 0.0)
         held = shown[every_nth(len(shown), how.hold_back)[1]]
         used = np.setdiff1d(np.arange(len(dataset.train)), held)
         if len(held) < _FEWEST_HELD:
             raise ValueError(
-                f"choosing a model holds back every {how.hold_back}th of {len(shown)} "
-                f"training views with an object; that makes {len(held)}, and at least "
+                f"choosing a model holds back one in {how.hold_back} of the {len(shown)} training "
+                f"views that show the object; that makes {len(held)}, and at least "
                 f"{_FEWEST_HELD} are needed: take more photographs, or train without --model auto"
             )
         self.how, self._config, self._folder, self._listener = how, config, folder, listener
@@ -288,12 +289,12 @@ class _Trials:
         lengths = np.maximum(np.linalg.norm(view_vectors, axis=1, keepdims=True), 1e-12)
         self.blocks = neighbouring_blocks(view_vectors / lengths)
         self._measured: dict[str, dict[str, Any]] = {}
-        self._stage_1_seconds: dict[str, float] = {}
+        self._first_stage_seconds: dict[str, float] = {}
         self._blocked: float | None = None
 
     @property
     def count(self) -> int:
-        """Trainings that were measured."""
+        """Trainings of models so far, those that failed included."""
         return len(self._measured)
 
     @property
@@ -302,7 +303,7 @@ class _Trials:
         trial_seconds = sum(
             float(measurement["seconds"]) for measurement in self._measured.values()
         )
-        return trial_seconds + sum(self._stage_1_seconds.values())
+        return trial_seconds + sum(self._first_stage_seconds.values())
 
     @property
     def state_path(self) -> Path:
@@ -310,7 +311,7 @@ class _Trials:
         return self._folder / _STATE
 
     def model(self, kept: Collection[str]) -> Config:
-        """Return the settings with only the named ones of the parts to choose."""
+        """Return the settings in which, of the parts on offer, only the named ones stay."""
         return without(self._config, [part for part in self._offered if part.name not in kept])
 
     def are_alike(self, names: Collection[str], others: Collection[str]) -> bool:
@@ -355,7 +356,7 @@ class _Trials:
                 "other options, or by another version; use the same again, or begin anew with "
                 "--force"
             )
-        self._measured, self._stage_1_seconds = measurements, seconds
+        self._measured, self._first_stage_seconds = measurements, seconds
 
     def _checked(self, measurement: Mapping[str, Any]) -> dict[str, Any]:
         """Return a measurement from the file; raise an error where it has another form."""
@@ -392,7 +393,7 @@ class _Trials:
             "mark": mark,
             "held_back": list(self.held.names),
             "blocks": self.blocks.tolist(),
-            "first_stages": self._stage_1_seconds,
+            "first_stages": self._first_stage_seconds,
             "trainings": self._measured,
             "blocked": self._blocked,
         }
@@ -442,7 +443,7 @@ class _Trials:
         """
         if self._blocked is None:
             self._start(False)
-            trained = load_trained(self._folder / _first_stage(False))
+            trained = load_trained(self._folder / _first_stage_name(False))
             pipeline = trained.pipeline
             self._blocked = float(
                 blocked_share(pipeline.surface, trained.params.geometry, pipeline.capacities)
@@ -455,16 +456,16 @@ class _Trials:
 
         There is one first stage for each size of the cells. It has all parts of the material.
         """
-        omitted_names = (*_SIZES, *(() if has_finer_cells else ("cells",)))
-        name = _first_stage(has_finer_cells)
+        omitted_names = (*_LATER_PARTS, *(() if has_finer_cells else ("cells",)))
+        name = _first_stage_name(has_finer_cells)
         omitted_parts = [part for part in self._offered if part.name in omitted_names]
         folder = self._folder / name
-        if name not in self._stage_1_seconds:
+        if name not in self._first_stage_seconds:
             start_time = time.perf_counter() - _seconds_used(folder)
             self._fit(
                 self._trial(without(self._config, omitted_parts), self._first, 0), folder, None
             )
-            self._stage_1_seconds[name] = round(time.perf_counter() - start_time, 2)
+            self._first_stage_seconds[name] = round(time.perf_counter() - start_time, 2)
             self._save(self._mark)
         return _start_of(folder)
 
@@ -504,7 +505,7 @@ def _decibels(renderer: Renderer, views: Views, view: int) -> float:
     return -10.0 * math.log10(max(mean_square, 1e-20))
 
 
-def _first_stage(has_finer_cells: bool) -> str:
+def _first_stage_name(has_finer_cells: bool) -> str:
     """Name the folder of a first stage."""
     return "first_stage_cells" if has_finer_cells else "first_stage"
 

@@ -557,7 +557,7 @@ def train(
     TypeError
         On any other keyword, on options of reading together with a dataset, which has been read
         already, and on a quality together with a config, a budget or a run that keeps its settings.
-    SceneError, RunError, TrainingError, Interrupted
+    SceneError, RunError, TrainingError, CheckpointError, Interrupted
         See `load_dataset` and `fit.train.fit`.
     ValueError
         If the mesh cannot be used, see `io.start_mesh`, or is another than that of the settings; if
@@ -575,15 +575,15 @@ def train(
         devices = choose_devices(devices)
     if model is not None and jax.process_count() > 1:  # asked after the devices were made
         raise ValueError("a model is chosen by one host; leave model out")
-    is_resumed = begin.goes_on(folder)
-    order = _Order(config, mesh, budget, reading)
+    is_resumed = begin.continues(folder)
+    request = _Request(config, mesh, budget, reading)
     if is_resumed:
-        order = _as_it_began(order, folder, chooses=model is not None)
-        if quality is not None and order.config is not None:
+        request = _as_it_began(request, folder, chooses=model is not None)
+        if quality is not None and request.config is not None:
             raise TypeError(
                 f"the run in {folder} keeps the settings that were chosen for it; leave quality out"
             )
-    config, budget, reading = _settled(order, scene, quality=quality or "standard")
+    config, budget, reading = _settled(request, scene, quality=quality or "standard")
     dataset = scene if isinstance(scene, Dataset) else load_recorded(scene, reading)
     evidence = None
     if model is not None and not is_resumed:
@@ -620,8 +620,8 @@ def train(
     return run
 
 
-class _Order(NamedTuple):
-    """Those arguments of `train` that a run which is resumed may complete; None where not given."""
+class _Request(NamedTuple):
+    """Arguments of `train` that the record of a resumed run may complete; None if not given."""
 
     config: Config | None
     mesh: str | Path | MeshSettings | None
@@ -641,7 +641,7 @@ def _require_consistent(
     if unknown_options := sorted(set(reading) - set(READING_OPTIONS)):
         raise TypeError(
             f"train takes no {', '.join(unknown_options)}; a scene is read by "
-            f"{', '.join(sorted(READING_OPTIONS))}, and settings belong into the config"
+            f"{', '.join(sorted(READING_OPTIONS))}, and settings belong in the config"
         )
     if isinstance(scene, Dataset) and reading:
         raise TypeError(
@@ -652,20 +652,23 @@ def _require_consistent(
         raise ValueError("a model is chosen for a whole training without a budget; leave model out")
 
 
-def _as_it_began(order: _Order, folder: RunFolder, *, chooses: bool) -> _Order:
-    """Complete the order to continue a run with the settings of that run.
+def _as_it_began(request: _Request, folder: RunFolder, *, chooses: bool) -> _Request:
+    """Complete a request to resume a run by the record of that run.
 
-    Settings that were chosen for the run's model or budget stay, unless the order has others. The
-    pace may have changed those of a budget since, so the planned ones count as well.
+    A run whose model was chosen keeps its settings if the request has none, or asks to choose
+    again. A run with a budget keeps its settings if the request has none, or has the planned ones
+    or the present ones, whose steps the pacer may have changed. Both then keep the budget and how
+    the scene was read. Other settings stay as requested; `resumed_loop` refuses them if they are
+    not those of the run. A start mesh that is not given is that of the run.
     """
     if chooses and not folder.has_chosen_model:
         raise RunError(
             f"the run in {folder} was begun without choosing a model; leave the choice out, or "
             "begin anew with --force"
         )
-    config, mesh, budget, reading = order
+    config, mesh, budget, reading = request
     if budget is not None and folder.budget() is None:
-        raise RunError(f"the run in {folder} was begun without a budget; leave that out")
+        raise RunError(f"the run in {folder} was begun without a budget; leave the budget out")
     keeps_model = folder.has_chosen_model and (config is None or chooses)
     has_budget = folder.budget() is not None
     if keeps_model or (has_budget and config in (None, folder.planned(), folder.config())):
@@ -674,14 +677,14 @@ def _as_it_began(order: _Order, folder: RunFolder, *, chooses: bool) -> _Order:
     has_own_mesh = config is not None and isinstance(config.geometry, MeshSettings)
     if mesh is None and not has_own_mesh:
         mesh = mesh_of_run(folder)
-    return _Order(config, mesh, budget, reading)
+    return _Request(config, mesh, budget, reading)
 
 
 def _settled(
-    order: _Order, scene: str | Path | Dataset, *, quality: str
+    request: _Request, scene: str | Path | Dataset, *, quality: str
 ) -> tuple[Config, Budget | None, dict[str, Any]]:
-    """Return settings, budget and how to read the scene: as ordered, chosen, or by default."""
-    config, mesh, budget, reading = order
+    """Return settings, budget and how to read the scene: as requested, chosen, or by default."""
+    config, mesh, budget, reading = request
     if config is None and budget is not None:
         training_plan = plan_training(
             scene,

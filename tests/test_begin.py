@@ -36,9 +36,9 @@ def test_options_say_how_a_run_begins(options, expected):
 
 def test_only_resuming_goes_on_with_a_run_and_only_where_there_is_one(tmp_path):
     run, beginnings = RunFolder(tmp_path), (ANEW, Anew(replace=True), TakeOver("a", "b"), Resume())
-    assert [beginning.goes_on(run) for beginning in beginnings] == [False] * 4
+    assert [beginning.continues(run) for beginning in beginnings] == [False] * 4
     (tmp_path / "run.json").write_text("{}")
-    assert [beginning.goes_on(run) for beginning in beginnings] == [False, False, False, True]
+    assert [beginning.continues(run) for beginning in beginnings] == [False, False, False, True]
     assert [beginning.replace for beginning in beginnings] == [False, True, False, False]
     assert [beginning.takes_over for beginning in beginnings] == [False, False, True, False]
 

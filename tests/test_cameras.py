@@ -603,7 +603,7 @@ def test_a_torn_and_a_missing_file_are_one_line(file, tmp_path):
 def test_missing_views_and_other_sizes_are_refused(file):
     path, views, _ = file
     split = read_cameras(path)["train"]
-    with pytest.raises(SceneError, match="no camera for 1 of 3 views, 'other' for one"):
+    with pytest.raises(SceneError, match="no camera for 1 of 3 views, for example 'other'"):
         with_cameras(replace(views, names=("view_0", "other", "view_2")), split, str(path))
     with pytest.raises(SceneError, match=r"images of 32 x 32, but these are 16 x 16.*--downscale"):
         with_cameras(replace(views, images=views.images[:, ::2, ::2]), split, str(path))

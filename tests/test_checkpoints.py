@@ -182,7 +182,7 @@ def test_another_configuration_is_refused_by_leaf(tmp_path):
         ({"sdf": jnp.ones(5), "key": jnp.zeros(2, jnp.uint32)}, r"\['key'\].* key threefry2x32"),
         ({"sdf": jnp.ones(5), "key": jax.random.key(0, impl="rbg")}, r"\['key'\].*the run has rbg"),
         ({"sdf": jnp.ones(5), "key": key, "b": 1}, r"lacks 1 leaves \(\['b'\]\)"),
-        ({"sdf": jnp.ones(5)}, r"has besides 1 leaves \(\['key'\]\)"),
+        ({"sdf": jnp.ones(5)}, r"also has 1 leaves \(\['key'\]\)"),
     ]
     for template, message in cases:
         with pytest.raises(CheckpointError, match=message):

@@ -92,6 +92,7 @@ def test_extremes_train_to_finite_numbers(overrides, tmp_path):
         ({"outcome": "stopped: too large", "steps": 0}, "ok"),
         ({"outcome": "stopped: too\nlarge", "steps": 0}, "refused in more than one line"),
         ({"outcome": "stopped: the term l1 is not finite", "steps": 3}, "not finite"),
+        ({"outcome": "stopped: the term l1 is not finite", "steps": 0}, "not finite"),
         ({"outcome": "ended with status -9: Killed", "steps": 0}, "crashed"),
     ],
 )

@@ -99,8 +99,11 @@ def test_pixels_that_nothing_covers_are_black_and_have_finite_gradients(scene):
 
 
 @pytest.mark.parametrize("detach", [True, False])
-def test_opacity_moves_colours_only_where_the_coverage_is_differentiated(scene, detach):
-    """With one attribute everywhere the straight colour cannot depend on opacity."""
+def test_opacity_pulls_on_a_uniform_colour_only_where_the_coverage_is_detached(scene, detach):
+    """The straight colour of one attribute everywhere does not depend on opacity.
+
+    The whole derivative says so; with the coverage held fixed a pull remains.
+    """
     pipeline, asset, camera = scene
     domain = PerPixel(detach_coverage=detach)
 

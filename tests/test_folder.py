@@ -4,6 +4,7 @@ import json
 import subprocess
 import sys
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,7 @@ from geosplat_jax.fit.folder import CAMERAS, RunError, RunFolder
 from geosplat_jax.fit.planning import TrainingError
 from geosplat_jax.fit.trained import load_trained
 from geosplat_jax.io.checkpoints import save_checkpoint
-from geosplat_jax.run import _as_it_began, _Order
+from geosplat_jax.run import _as_it_began, _Request
 
 
 @pytest.fixture
@@ -231,7 +232,7 @@ def test_the_record_keeps_the_path_of_cameras_that_it_was_given(run, monkeypatch
 def test_what_other_commands_left_in_the_folder_is_in_nobodys_way(run, dataset):
     (run.path / "renders").mkdir()
     for _ in range(2):  # the training that should follow may be interrupted, and be made again
-        run.make_room(replace=True)
+        run.make_room()
         assert not run.exists
     with run.locked():
         run.require_free(replace=False)
@@ -244,9 +245,10 @@ def test_what_other_commands_left_in_the_folder_is_in_nobodys_way(run, dataset):
 
 def test_a_folder_of_others_is_refused_before_any_work(tmp_path):
     (tmp_path / "thesis.tex").write_text("")
-    for prepare in (RunFolder(tmp_path).require_free, RunFolder(tmp_path).make_room):
+    run_folder = RunFolder(tmp_path)
+    for prepare in (partial(run_folder.require_free, replace=True), run_folder.make_room):
         with pytest.raises(RunError, match=r"holds other files, for example thesis\.tex"):
-            prepare(replace=True)
+            prepare()
 
 
 def test_linked_folders_of_a_run_are_unlinked_when_it_is_replaced(run, dataset, tmp_path):
@@ -277,10 +279,10 @@ def test_the_settings_of_a_run_with_a_budget_keep_its_budget(dataset, tmp_path):
         folder.begin(dataset, tiny_config(), replace=False, budget=Budget(60.0))
         folder.amend(tiny_config("stages.split_sum.steps=2"))
     for config in (None, folder.planned(), folder.config()):
-        order = _as_it_began(_Order(config, None, None, {}), folder, chooses=False)
+        order = _as_it_began(_Request(config, None, None, {}), folder, chooses=False)
         assert (order.budget, order.config) == (Budget(60.0), folder.config())
     other = tiny_config("stages.split_sum.steps=3")
-    assert _as_it_began(_Order(other, None, None, {}), folder, chooses=False).budget is None
+    assert _as_it_began(_Request(other, None, None, {}), folder, chooses=False).budget is None
 
 
 def test_an_accident_leaves_what_was_noted_of_the_training(run, monkeypatch):

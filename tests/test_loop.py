@@ -47,7 +47,7 @@ def test_free_splats_are_not_planned_while_vertices_are_sampled():
     )
     loop = object.__new__(loop_module.Loop)
     loop.config, loop.stage = config, config.stage("split_sum")
-    is_planned = [loop._following(step) is not None for step in range(10)]
+    is_planned = [loop._next_stage_if_near(step) is not None for step in range(10)]
     assert is_planned == [False] * 6 + [True] * 4
 
 
@@ -89,7 +89,7 @@ def steps(monkeypatch):
         monkeypatch.setattr(loop_module, "compile_step", lambda *a, **k: True)
         monkeypatch.setattr(loop_module, "plan_capacities", lambda *a, **k: Capacities(hits=128))
         # Otherwise the next stage would be planned and compiled in the background.
-        monkeypatch.setattr(loop_module.Loop, "_following", lambda *a: None)
+        monkeypatch.setattr(loop_module.Loop, "_next_stage_if_near", lambda *a: None)
         return recorder
 
     return install

@@ -194,7 +194,7 @@ def capture(tmp_path, monkeypatch):
         return a_ball_before_a_wall()
 
     monkeypatch.setattr(masks_module, "train_radiance", train_radiance)
-    monkeypatch.setattr(masks_module, "quality", lambda *a: np.array([20.0, 22.0]))
+    monkeypatch.setattr(masks_module, "psnr_by_view", lambda *a: np.array([20.0, 22.0]))
     (tmp_path / "run").mkdir()
     return root, tmp_path / "run"
 
@@ -298,7 +298,7 @@ def test_only_one_process_writes_the_masks_of_a_folder(capture, monkeypatch):
             make_masks(read(root), SETTINGS, run, box=BOX, resume=True)
         return np.array([20.0])
 
-    monkeypatch.setattr(masks_module, "quality", written_by_two)
+    monkeypatch.setattr(masks_module, "psnr_by_view", written_by_two)
     assert make_masks(read(root), SETTINGS, run, box=BOX).masks == COUNT
 
 

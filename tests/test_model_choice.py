@@ -348,7 +348,7 @@ def test_views_without_the_object_are_not_held_back(dataset, trainings, tmp_path
 
 def test_too_few_views_are_refused(trainings, tmp_path):
     small_dataset = sphere_dataset(count=16, size=8)
-    with pytest.raises(ValueError, match="holds back every 8th of 16 training views"):
+    with pytest.raises(ValueError, match="holds back one in 8 of the 16 training views"):
         choose_model(small_dataset, tiny_config(), tmp_path / "run")
     assert not trainings.made
 

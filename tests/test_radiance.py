@@ -14,7 +14,7 @@ from geosplat_jax.capture import training
 from geosplat_jax.capture.settings import RadianceRates, RadianceSettings, RelocationSettings
 from geosplat_jax.capture.start import CaptureError, first_splats, random_points, standard_world
 from geosplat_jax.capture.training import (
-    quality,
+    psnr_by_view,
     relocates_after,
     train_radiance,
     weights_at,
@@ -338,7 +338,7 @@ def test_training_lowers_the_loss_and_fills_the_capacity(trained):
     counts = [report.splat_count for report in reports]
     assert counts[0] == 32
     assert counts[-1] == radiance.splats.capacity > 40
-    assert quality(radiance, scene_views()).mean() > 14.0
+    assert psnr_by_view(radiance, scene_views()).mean() > 14.0
 
 
 def test_photographs_brighter_than_white_are_judged_as_they_were_trained(monkeypatch):
@@ -347,7 +347,7 @@ def test_photographs_brighter_than_white_are_judged_as_they_were_trained(monkeyp
     picture = np.asarray(encode_srgb(np.minimum(bright.images[..., :3], 1.0)))
     monkeypatch.setattr(training, "render_views", lambda *a: (picture, picture[..., 0]))
     assert bright.images[..., :3].max() > 4
-    assert quality(training.Radiance(some_splats(2), 0.1, 0), bright).min() > 100
+    assert psnr_by_view(training.Radiance(some_splats(2), 0.1, 0), bright).min() > 100
 
 
 @pytest.mark.slow

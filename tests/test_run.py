@@ -110,7 +110,7 @@ def test_a_refused_choice_leaves_the_run_that_it_was_to_replace(tmp_path):
     old_folder = RunFolder(tmp_path / "run")
     with old_folder.locked():
         old_folder.begin(small_dataset, make_config(overrides=TINY), replace=False)
-    with pytest.raises(ValueError, match="holds back every 8th of 6"):
+    with pytest.raises(ValueError, match="holds back one in 8 of the 6"):
         gs.train(small_dataset, old_folder.path, model="auto", begin=gs.Anew(replace=True))
     assert old_folder.exists
 

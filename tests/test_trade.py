@@ -385,7 +385,7 @@ def test_figures_on_images_of_another_size_are_another_evaluation(tmp_path, caps
     selection = _arguments(tmp_path, "--scene", "one", "--only")
     assert runner.main([*selection, "coarse"], start=Trained().start) == 0
     assert runner.main([*selection, "half", "--downscale", "4"], start=Trained().start) == 0
-    sweep = trade.report._read_sweep(tmp_path / "runs")
+    sweep = trade.report.read_record(tmp_path / "runs")
     entry = trade.report.read_entries(tmp_path / "runs", sweep)["one"]["coarse"]
     assert entry.problem == "evaluated on images reduced by 1 instead of 4"
     capsys.readouterr()

@@ -173,22 +173,20 @@ def train_corner(corner: Corner, steps: int, gigabytes: float) -> dict[str, Any]
     }
 
 
-def verdict(corner: Corner, found: dict[str, Any], steps: int) -> str:
+def verdict(corner: Corner, result: dict[str, Any], steps: int) -> str:
     """Return ``ok`` if a corner behaved as it should, or what went wrong."""
-    outcome = found["outcome"]
+    outcome = result["outcome"]
     if outcome.startswith("stopped: "):
         if "\n" in outcome:
             return "refused in more than one line"
-        if found["steps"]:
-            return "ok" if "not finite" not in outcome else "not finite"
-        return "ok"
+        return "not finite" if "not finite" in outcome else "ok"
     if outcome != "trained":
         return "crashed"
     if corner.is_refused:
         return "not refused"
-    if found["steps"] != steps:
-        return f"{found['steps']} steps"
-    return "ok" if found["finite"] else "not finite"
+    if result["steps"] != steps:
+        return f"{result['steps']} steps"
+    return "ok" if result["finite"] else "not finite"
 
 
 def in_a_process(corner: Corner, steps: int, gigabytes: float) -> dict[str, Any]:

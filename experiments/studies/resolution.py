@@ -11,8 +11,8 @@ proportional to that of cells, ``--steps`` for the smallest grid, because a fine
 further to move, in cells.
 
 Columns: PSNR of new views; normal error; Chamfer distance as in `existing_mesh.py`, if the scene
-has a true mesh; recall of thin parts, which is the share that the render covers by more than half,
-of pixels that an opening of the true mask by a disc of 3 pixels removes; number of Gaussians;
+has a true mesh; recall of thin parts: of the pixels that an opening of the true mask by a disc of
+radius 3 removes, the share that the render covers by more than half; number of Gaussians;
 median seconds of a step; minutes of the training; peak memory. Below follow the exponents with
 which Gaussians, seconds of a step and memory grow with the cells, by least squares on logarithms.
 ``--picture`` shows the first test view of the first scene: render, normals and mesh, the truth

@@ -276,16 +276,16 @@ def _largest_cluster(
 
 
 def _cut_at_plane(
-    low: np.ndarray, high: np.ndarray, plane: np.ndarray, cluster: np.ndarray
+    low: np.ndarray, high: np.ndarray, ground_points: np.ndarray, cluster: np.ndarray
 ) -> Bounds:
     """Keep the box from crossing the ground, if that is nearly parallel to a side of the box.
 
     The normal of the ground must be within 15 degrees of an axis.
 
-    ``plane`` : (M, 3) points of the ground. ``cluster`` : (N, 3) points of the object.
+    ``ground_points`` : (M, 3) points of the ground. ``cluster`` : (N, 3) points of the object.
     """
-    middle = plane.mean(0)
-    normal = np.linalg.svd(plane - middle, full_matrices=False)[2][2]
+    middle = ground_points.mean(0)
+    normal = np.linalg.svd(ground_points - middle, full_matrices=False)[2][2]
     axis = int(np.argmax(np.abs(normal)))
     if abs(normal[axis]) < np.cos(np.radians(15.0)):
         return low, high

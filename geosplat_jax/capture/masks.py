@@ -28,7 +28,7 @@ from geosplat_jax.capture.start import CaptureError, require_trainable
 from geosplat_jax.capture.training import (
     RECORD,
     Radiance,
-    quality,
+    psnr_by_view,
     render_views,
     train_radiance,
 )
@@ -60,7 +60,7 @@ _LEAST_AGREEMENT = 0.9
 _MOST_CUT = 0.05
 """Limits of the figures in `Certainty`, beyond which there is a warning."""
 _SHEET_VIEWS = 6
-_SHEET_WIDTH = 200  # least pixels of a picture: the text below the sheet is as wide as three
+_SHEET_WIDTH = 200  # least width of a picture, pixels: three are about as wide as the notes below
 _DIM = 0.12  # brightness outside of the mask in the sheet
 _DISSENT = (0.9, 0.35, 0.1)  # colour that half-opaque pixels are marked with
 
@@ -228,7 +228,7 @@ def _write_masks(
     """Write splats, masks, sheet and report, see `make_masks`."""
     files = [mask_file(dataset.root, frame.image) for frame in frames]
     write_splats(radiance, folder / "splats.ply")
-    psnr = float(quality(radiance, dataset.test).mean()) if len(dataset.test) else None
+    psnr = float(psnr_by_view(radiance, dataset.test).mean()) if len(dataset.test) else None
     views = _all_views(dataset)
     clipped, (lo, hi), plane = _clipped(radiance, dataset.train, box, seed)
     write_splats(clipped, folder / "object.ply")

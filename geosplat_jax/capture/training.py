@@ -114,7 +114,7 @@ class StepWeights(eqx.Module):
 
 
 class RadianceReport(eqx.Module):
-    """Outcome of a step; the state changed only where it is finite and fits.
+    """Outcome of a step; the state changes only if the new one is finite and the buffers suffice.
 
     Attributes
     ----------
@@ -562,7 +562,7 @@ def render_views(
     return np.stack(colors), np.stack(alphas)
 
 
-def quality(radiance: Radiance, views: Views) -> Float[np.ndarray, " V"]:
+def psnr_by_view(radiance: Radiance, views: Views) -> Float[np.ndarray, " V"]:
     """Return the PSNR of renders against photographs, (V,) decibels, in sRGB over black."""
     rgb, _ = render_views(radiance, views.camera())
     truth = np.asarray(linear_to_srgb(jnp.asarray(views.clipped(range(len(views)))[..., :3])))

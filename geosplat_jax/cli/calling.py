@@ -7,6 +7,7 @@ from jax.errors import JaxRuntimeError
 from geosplat_jax.cli.arguments import command_line
 from geosplat_jax.cli.commands import COMMANDS, GradientError, UsageError
 from geosplat_jax.cli.display import say, show_warning
+from geosplat_jax.cli.stopping import STOPPED
 from geosplat_jax.core.settings import first_line
 from geosplat_jax.fit.folder import RunError
 from geosplat_jax.fit.runtime import enable_compilation_cache
@@ -36,7 +37,7 @@ def call(argv: list[str] | None) -> int:
             COMMANDS[arguments.command](arguments)
     except Interrupted as stop:
         say(str(stop))
-        return 130
+        return STOPPED
     except GradientError as error:
         say(str(error))
         return 1

@@ -116,11 +116,11 @@ class ProgressDisplay(Listener):
                 TextColumn("{task.fields[left]}"),
                 console=console,
             )
+        self._compiling: tuple[str, float] | None = None
+        self._compile_seconds: float | None = None
 
     def __enter__(self) -> "ProgressDisplay":
         """Start the bar."""
-        self._compiling: tuple[str, float] | None = None
-        self._compile_seconds: float | None = None
         if self._bar is not None:
             self._bar.start()
             self._task = self._bar.add_task(

@@ -108,14 +108,14 @@ class _Request:
     reading : how to read the scene, see `load_recorded`.
     budget : limits on time and memory; None for none.
     model : how to choose the parts of the model; None for those of the settings.
-    goes_on : whether all of this comes from the record of a run that is resumed.
+    is_recorded : whether all of this comes from the record of a run that is resumed.
     """
 
     config: Config
     reading: dict[str, Any]
     budget: Budget | None = None
     model: ModelChoice | None = None
-    goes_on: bool = False
+    is_recorded: bool = False
 
 
 _SETTING_OPTIONS = {
@@ -170,12 +170,12 @@ def _request_of(arguments: argparse.Namespace, folder: RunFolder) -> _Request:
         _require_no_settings(arguments, folder, but="--downscale" if chooses_size else None)
         # The settings of the run were chosen for the budget, and have been adapted since.
         reading = folder.record()["dataset"]
-        return _Request(folder.config(), reading, recorded_budget, goes_on=True)
+        return _Request(folder.config(), reading, recorded_budget, is_recorded=True)
     if arguments.resume and folder.exists and arguments.budget is not None:
         raise UsageError(f"{folder} was begun without a budget; leave --budget out")
     if arguments.resume and folder.has_chosen_model:
         _require_no_settings(arguments, folder)
-        return _Request(folder.config(), folder.record()["dataset"], goes_on=True)
+        return _Request(folder.config(), folder.record()["dataset"], is_recorded=True)
     if arguments.model is not None and (arguments.budget or arguments.source):
         raise UsageError("--model auto chooses for a whole training; leave --budget and --from out")
     if arguments.budget is None:
@@ -261,7 +261,7 @@ def _events(is_enabled: bool, folder: Path) -> Iterator[Listener]:
 
 @contextmanager
 def _table(path: Path | None, folder: Path) -> Iterator[None]:
-    """Write the steps of a run to a CSV file when the training ends, also by an error.
+    """Write the steps of a run to a CSV file when the training ends, even if it ends with an error.
 
     A command that is refused has made no step, and does not change the file.
     """
@@ -350,7 +350,7 @@ def train(arguments: argparse.Namespace) -> None:
         if not run_folder.record()["dataset"].get("cameras"):
             raise UsageError(f"{folder} was begun without --refine-cameras; leave it out")
     # The record of a resumed run names its refined cameras already.
-    if arguments.refine_cameras is not None and not request.goes_on:
+    if arguments.refine_cameras is not None and not request.is_recorded:
         reading["cameras"] = _refined_cameras(arguments, folder, reading, config.geometry)
     dataset = load_recorded(arguments.scene, reading)
     if arguments.resume and run_folder.exists:

@@ -1,1 +1,1 @@
-"""Fitting: settings, stages, the training step and the loop around it. Host side."""
+"""Fitting: settings, stages, the training step and the loop around it."""

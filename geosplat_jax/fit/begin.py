@@ -28,7 +28,7 @@ class Begin:
     resumes: ClassVar[bool] = False
     takes_over: ClassVar[bool] = False
 
-    def goes_on(self, run: RunFolder) -> bool:
+    def continues(self, run: RunFolder) -> bool:
         """Whether this continues a run that the folder holds; False where it holds none."""
         return self.resumes and run.exists
 
@@ -73,8 +73,8 @@ class Anew(Begin):
 class Resume(Begin):
     """Continue the run that the folder holds, from its last good checkpoint.
 
-    Begins anew where the folder holds no run, or the run has no checkpoint. The result equals that
-    of the uninterrupted run bit for bit.
+    Begins anew where the folder holds no run, or the run has no checkpoint. On a CPU and without a
+    budget, the result equals that of the uninterrupted run bit for bit.
 
     Parameters
     ----------

@@ -64,8 +64,8 @@ colour, as Monte Carlo does: until that albedo is learned, the result is worse t
 stage."""
 
 _TO_COME_BACK = 1.2
-"""A stage that was left out returns when it would make this many times those steps, so that a stage
-near the limit does not come and go at every check."""
+"""A stage that was left out returns only when it would make this factor times its fewest worthwhile
+steps, so that a stage near the limit does not come and go at every check."""
 
 _UNITS = {"s": 1.0, "sec": 1.0, "min": 60.0, "m": 60.0, "h": 3600.0}
 _BYTES = {"mb": 1e6, "mib": 2.0**20, "gb": 1e9, "gib": 2.0**30}
@@ -197,8 +197,8 @@ def plan(
     ]
     if budget.memory is not None and candidates[0].memory > budget.memory:
         raise TrainingError(
-            f"about {candidates[0].memory / 1e9:.1f} GB are the least that a training takes, "
-            f"more than --memory allows ({budget.memory / 1e9:.1f} GB)"
+            f"a training takes at least about {candidates[0].memory / 1e9:.1f} GB, more than "
+            f"--memory allows ({budget.memory / 1e9:.1f} GB)"
         )
     limits = [limit for limit in (budget.memory, _memory_here()) if limit is not None]
     # Expectations may be wrong: the smallest settings are tried even where they should not fit.
@@ -207,7 +207,7 @@ def plan(
     ]
     candidates = feasible or candidates[:1]
     affordable = [candidate for candidate in candidates if candidate.seconds <= budget.seconds]
-    if not affordable and not _asks_for_more(overrides, candidates[0].config):
+    if not affordable and not _changes_later_stage(overrides, candidates[0].config):
         candidates = [_first_stage_alone(candidate) for candidate in candidates]
         affordable = [candidate for candidate in candidates if candidate.seconds <= budget.seconds]
     base_plan = affordable[-1] if affordable else candidates[0]
@@ -260,7 +260,7 @@ def _candidate(
     return Plan(config, downscale, effort, costs, seconds, expected_memory(config, pixels))
 
 
-def _asks_for_more(overrides: Sequence[str], config: Config) -> bool:
+def _changes_later_stage(overrides: Sequence[str], config: Config) -> bool:
     """Whether an override changes a setting of a stage after the first."""
     later = tuple(f"stages.{stage.name}." for stage in config.active_stages[1:])
     return any(text.startswith(later) for text in overrides)

@@ -89,9 +89,9 @@ class CameraSettings:
     white_balance: bool = False
     """Also find factors of red, green and blue for every view, besides that of the exposure."""
     tolerance: Positive = 1e-2
-    """The solver stops when a step changes the parameters by less than this many hundredths, and
-    the differences by less than this many deviations (root mean square). Relative changes of this
-    size are allowed in addition."""
+    """The solver stops when a step changes its variables (parameters over `UNIT`) and the residuals
+    by less than this, as root mean squares; relative changes of this size are allowed in
+    addition."""
 
     @property
     def parameter_count(self) -> int:
@@ -320,7 +320,7 @@ def _robust(deviations: Float[Array, " R"], knee: float) -> Float[Array, " R"]:
     return deviations * jnp.sqrt(2.0 / (1.0 + jnp.sqrt(1.0 + (deviations / knee) ** 2)))
 
 
-class Found(eqx.Module):
+class Refinement(eqx.Module):
     """What the solver found for one view.
 
     Attributes
@@ -341,7 +341,7 @@ class Found(eqx.Module):
 @partial(jax.jit, static_argnames=("how",))
 def _solve(
     start: Float[Array, " P"], subject: Subject, photograph: PosedPhotograph, *, how: CameraSettings
-) -> Found:
+) -> Refinement:
     """Run Levenberg-Marquardt; valid only where both fits' usage is within the capacities."""
     box = subject.pipeline.surface.box
     subject = subject.seen_from(moved_camera(photograph.camera, UNIT * start, box)[0])
@@ -357,7 +357,7 @@ def _solve(
     iterates = jnp.stack([start, solution.value])
     before, after = _both(jax.lax.map(lambda y: residual(y, None)[1], iterates))
     camera, _ = moved_camera(photograph.camera, UNIT * solution.value, box)
-    return Found(solution.value, camera, before, after, solution.stats["num_steps"])
+    return Refinement(solution.value, camera, before, after, solution.stats["num_steps"])
 
 
 def _both(fits: Fit) -> tuple[Fit, Fit]:
@@ -368,7 +368,7 @@ def _both(fits: Fit) -> tuple[Fit, Fit]:
 
 def refine_view(
     subject: Subject, photograph: PosedPhotograph, how: CameraSettings
-) -> tuple[Found, Capacities]:
+) -> tuple[Refinement, Capacities]:
     """Refine the camera of one view, with buffers that grow until no iterate overflows (host side).
 
     Parameters
@@ -383,7 +383,7 @@ def refine_view(
     capacities : buffer sizes that the refinement needed.
     """
 
-    def attempt(capacities: Capacities) -> tuple[Found, Usage]:
+    def attempt(capacities: Capacities) -> tuple[Refinement, Usage]:
         pipeline = replace(subject.pipeline, capacities=capacities)
         sized_subject = replace(subject, pipeline=pipeline)
         start = jnp.zeros(how.parameter_count, photograph.image.dtype)
@@ -478,7 +478,7 @@ def _kept(
     )
 
 
-def _refined(result: Found, views: Views, index: int) -> RefinedCamera:
+def _refined(result: Refinement, views: Views, index: int) -> RefinedCamera:
     """Return the refined camera of a view, or the initial one where refinement did not help."""
     note = _refusal(result)
     initial_camera = _kept(
@@ -533,7 +533,7 @@ def with_mean_balance(splits: Mapping[str, RefinedSplit]) -> dict[str, RefinedSp
     return {name: divided(split) for name, split in splits.items()}
 
 
-def _refusal(result: Found) -> str:
+def _refusal(result: Refinement) -> str:
     """Say why a view keeps its camera; "" where it does not."""
     if float(result.before.covered) == 0:
         return "the mask is empty"

@@ -41,8 +41,15 @@ from geosplat_jax.transport.monte_carlo import MonteCarloSettings
 from geosplat_jax.transport.paths import PathSettings
 from geosplat_jax.transport.split_sum import SplitSumSettings
 
-TRANSPORTS = (SplitSumSettings, MonteCarloSettings, PathSettings)
-"""Transports that a run may name: a kind is known once its class is imported."""
+_KNOWN_KINDS = (
+    SplitSumSettings,
+    MonteCarloSettings,
+    PathSettings,
+    FreeSplatSettings,
+    MeshSettings,
+    PerPixel,
+)
+"""Kinds of settings that a run may name: a kind can be read once its class is imported."""
 
 LABELS = {"preset": "--preset", "quality": "--quality", "material_prior": "--material-prior"}
 """Fields of `Config` that only record what was requested, and the options that set them."""
@@ -346,10 +353,6 @@ class Config:
         values = to_plain(self)
         values["stages"] = {stage.pop("name"): stage for stage in values["stages"]}
         return values
-
-
-KNOWN_KINDS = (FreeSplatSettings, MeshSettings, PerPixel)
-"""Kinds of settings that are imported for this alone: only kinds that are imported can be read."""
 
 
 def config_from_dict(values: Any) -> Config:

@@ -3,9 +3,8 @@
 The model is a sum of terms, each an amount of work times a constant. The constants were fitted to
 runs (`experiments/studies/costs.py`). The speed of this machine is measured with a kernel whose
 time on the reference machine is known. Where the number of splats is known, the constants explain
-runs of three objects on idle machines to 8 %, and to 12 % since steps that trace rays became
-faster. Before a run this number is not known, and predictions are good to a third; `budget.Pacer`
-corrects them by measurements during the training.
+runs of three objects on idle machines to 12 %. Before a run this number is not known, and
+predictions are good to a third; `budget.Pacer` corrects them by measurements during the training.
 """
 
 import statistics
@@ -56,8 +55,8 @@ class StageCost:
 
     Attributes
     ----------
-    startup : seconds before its first step ends, compilation included.
-    step : seconds of any other step.
+    startup : seconds before its first step, compilation included.
+    step : seconds of each of its steps.
     """
 
     startup: float

@@ -64,11 +64,11 @@ class IndirectHead(NamedTuple):
     Attributes
     ----------
     outputs : learned numbers per point; 0 for none.
-    goes_on : whether these numbers mean what they meant in the stage before.
+    keeps_meaning : whether these numbers mean what they meant in the stage before.
     """
 
     outputs: int
-    goes_on: bool
+    keeps_meaning: bool
 
 
 @settings
@@ -167,7 +167,7 @@ def enter_stage(
     The first parameters of the next stage.
     """
     entry_key, indirect_key = jax.random.split(key)
-    if not indirect.goes_on:
+    if not indirect.keeps_meaning:
         params = replace(
             params,
             material=replace(params.material, indirect_head=None),

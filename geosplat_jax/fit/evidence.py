@@ -45,7 +45,7 @@ class Rung:
     part, title : name of the part in files, and its name for people.
     smaller : mean decibels of the held-back views without the part.
     larger : the same with the part; None where its training failed, and for a part that is not
-        chosen by its gain (`Part.is_photographed`) or that no trial contains.
+        chosen by its gain (`Part.shows_in_photographs`) or that no trial contains.
     found : the gain and its errors; None where ``larger`` is.
     is_kept : whether the part was kept.
     note : why there is no gain to compare, or which other parts were added with this one.

@@ -5,7 +5,7 @@
     run.json              scene, how it was read, settings, versions
     metrics.jsonl         one line per step
     checkpoints/          parameters, optimiser, step, capacities
-    stages/NAME/          the checkpoint that stage NAME ended with
+    stages/NAME/          the checkpoint that stage NAME ended with, and its evaluation
     previews/             photograph, render and normals during the training
     given_cameras.json    copy of the refined cameras that the run was trained with, if any
     training.json         how long the whole training took
@@ -162,7 +162,11 @@ def _foreign_names(path: Path) -> list[str]:
 
 
 class RunFolder:
-    """The folder of a run; files are read and written by its methods only."""
+    """The folder of a run: where its files are, and how its record and its metrics are read.
+
+    `fit.train` appends to the metrics; checkpoints, previews and evaluations are written by modules
+    of their own.
+    """
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path).expanduser()
@@ -284,7 +288,7 @@ class RunFolder:
                 "choose another --output"
             )
 
-    def make_room(self, *, replace: bool) -> None:
+    def make_room(self) -> None:
         """Remove a run that is to be replaced, before work that precedes the new run.
 
         If that work is interrupted and continued later, the old run is no longer in the way.
@@ -292,9 +296,9 @@ class RunFolder:
         Raises
         ------
         RunError
-            If there is a run and ``replace`` is not set, or another process holds it.
+            If the folder holds other files but no run, or another process holds it.
         """
-        self.require_free(replace=replace)
+        self.require_free(replace=True)
         if self.exists:
             with self.locked():
                 self.clear()

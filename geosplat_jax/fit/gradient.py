@@ -6,7 +6,8 @@ per view. So a step of eight views compiles as fast as one of a single view, a b
 costs a compilation of only those programs that use it, and programs can be compiled in parallel or
 before they are needed.
 
-`value_and_gradient` equals ``jax.value_and_grad(pipeline.loss, has_aux=True)`` up to rounding.
+`value_and_gradient` equals ``jax.value_and_grad(pipeline.loss, has_aux=True)`` up to rounding;
+groups in ``frozen`` get a gradient of zero.
 """
 
 from collections.abc import Callable
@@ -282,6 +283,7 @@ def value_and_gradient(
     listing_pipeline, pipeline = (
         replace(pipeline, capacities=Capacities(**sizes)) for sizes in _divided(pipeline.capacities)
     )
+    # Side by side is faster only for programs that trace rays, see `SideBySide`.
     run_all = run.all if pipeline.uses_rays else partial(Runner.all, run)
     asset, asset_pullback = run(_asset, pipeline, params, frozen)
     numbers = jax.device_put([np.int32(number) for number in range(batch.count)])

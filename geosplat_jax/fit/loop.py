@@ -50,9 +50,9 @@ from geosplat_jax.fit.trained import (
     NextStage,
     read_checkpoint,
     read_description,
-    taken_over,
+    taken_over_message,
 )
-from geosplat_jax.fit.upcoming import Ends, Upcoming, continued
+from geosplat_jax.fit.upcoming import PresentStage, Upcoming, continued
 from geosplat_jax.io.checkpoints import latest_checkpoint, read_step, save_checkpoint
 from geosplat_jax.io.dataset import Dataset
 from geosplat_jax.io.views import Views
@@ -62,7 +62,9 @@ from geosplat_jax.render import Params
 from geosplat_jax.surface.base import SurfaceModel
 
 _RECOVERIES_ALLOWED = 3
+"""Times that a vanished surface is put back before the run stops."""
 _SHRINK_EVERY = 100
+"""Steps between two checks for buffers that are too large."""
 _WORTH = 100
 """Steps to come in a stage for which smaller buffers are worth the compilation that they take."""
 _FOLLOW_EVERY = 10
@@ -72,14 +74,14 @@ _LOOK_AHEAD = 200
 """Most steps before the end of a stage at which the next stage's programs are compiled."""
 
 
-class First(NamedTuple):
+class StageStart(NamedTuple):
     """Surface and shape that a stage began with; on the host, since steps consume their buffers."""
 
     surface: SurfaceModel
     shape: Any
 
     @classmethod
-    def of(cls, surface: SurfaceModel, shape: Any) -> "First":
+    def of(cls, surface: SurfaceModel, shape: Any) -> "StageStart":
         """Copy a shape out of buffers that a step will consume."""
         return cls(surface, jax.tree.map(np.array, shape))
 
@@ -106,10 +108,11 @@ class Loop:
     fallback : surface and shape that the stage began with.
     last_checkpoint : path of the last checkpoint; None where none was written yet.
     upcoming : the next stage, once it is near.
-    has_compiled : set by whatever compiles, and reset by whoever measures time.
-    is_compiled : set by whatever compiles, and never reset.
-    fits_twice : what `compile_step` returned.
-    to_come : what a checkpoint said about the next stage.
+    has_compiled : whether anything was compiled since the present step began, so that its duration
+        says nothing about the pace; `train` resets it.
+    is_compiled : whether this process has compiled a step; False at first, also in a resumed run.
+    fits_twice : whether the memory holds two programs of a step at a time, see `compile_step`.
+    to_come : plan of the next stage, from the checkpoint that the run goes on from; None once used.
     on_compile : called with the stage's name before a compilation that a step waits for.
     """
 
@@ -126,7 +129,7 @@ class Loop:
     peak: dict[str, int] | None = None
     peak_before: dict[str, int] | None = None
     recoveries: int = 0
-    fallback: "First | None" = None
+    fallback: "StageStart | None" = None
     last_checkpoint: Path | None = None
     upcoming: Upcoming | None = None
     has_compiled: bool = False
@@ -231,14 +234,14 @@ class Loop:
         elif not self.is_compiled:  # resumed: all is planned, but nothing is compiled
             self._announce()
             self._compile(step)
-        next_stage = self._following(step)
+        next_stage = self._next_stage_if_near(step)
         if next_stage is not None and self.upcoming is None:
             # A copy, since the steps to come consume the buffers of the state.
             params = jax.tree.map(jnp.array, self.params)
-            ends = Ends(
+            present = PresentStage(
                 self.config, self.views, self.pipeline, params, self.devices, self._needed()
             )
-            self.upcoming = Upcoming(next_stage, ends, self.to_come)
+            self.upcoming = Upcoming(next_stage, present, self.to_come)
 
     def retime(self, config: Config) -> None:
         """Continue with stages of other lengths; steps that are done do not change."""
@@ -286,7 +289,7 @@ class Loop:
             limits=self.config.geometry.limits,
         )
 
-    def _following(self, step: int) -> Stage | None:
+    def _next_stage_if_near(self, step: int) -> Stage | None:
         """Return the next stage, where its beginning is near and can be planned."""
         stages = self.config.active_stages
         number = stages.index(self.stage) + 1
@@ -336,7 +339,7 @@ class Loop:
 
     def start(self, params: Params) -> None:
         """Begin the stage with these parameters."""
-        self.fallback = First.of(self.surface, params.geometry)
+        self.fallback = StageStart.of(self.surface, params.geometry)
         carry = self.pipeline.transport.first_carry()
         self.state = self.devices.place(initial_state(params, step=self.step, carry=carry))
 
@@ -601,7 +604,7 @@ def resumed_loop(
         previous_end = latest_checkpoint(folder.end_of(stage_names[number - 1]))
         if previous_end is not None:
             tree, _ = read_checkpoint(previous_end, config)
-            loop.fallback = First.of(tree["surface"], tree["state"].params.geometry)
+            loop.fallback = StageStart.of(tree["surface"], tree["state"].params.geometry)
     return loop
 
 
@@ -663,7 +666,7 @@ def adopted_loop(
     tree, description = read_checkpoint(path, source_config)
     steps_done, end = int(tree["state"].step), config.first_step(name)
     if steps_done > end:
-        raise TrainingError(taken_over(source, previous.name))
+        raise TrainingError(taken_over_message(source, previous.name))
     if description.stage != previous.name or steps_done != end:
         raise TrainingError(
             f"{path} is at step {steps_done}, in the stage {description.stage}, not at the end of "

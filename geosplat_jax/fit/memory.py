@@ -16,7 +16,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from geosplat_jax.fit.config import Config, Stage
+from geosplat_jax.fit.config import Config
 from geosplat_jax.fit.planning import TrainingError
 from geosplat_jax.fit.pyramid import level_sizes
 from geosplat_jax.io.dataset import Dataset
@@ -51,10 +51,7 @@ def training_needs(config: Config, dataset: Dataset) -> list[Need]:
         Need("stages.*.batch_views", views * pixels * _PIXEL_BYTES),
         Need("geometry", _COPIES_LEARNED * config.geometry.parameter_bytes(dataset.bounds)),
         Need("light", light + _transport_bytes(config)),
-        *(
-            Need(need.what, _COPIES_LEARNED * need.byte_count)
-            for need in _field_needs(config, config.active_stages)
-        ),
+        *(Need(need.what, _COPIES_LEARNED * need.byte_count) for need in _field_needs(config)),
         Need("objective.smoothness_samples", _smoothness_bytes(config)),
         Need("stages.*.transport.*_count", _sample_bytes(config)),
     ]
@@ -130,7 +127,7 @@ def require_rendering_memory(
         In one line, with the file and the settings that need most.
     """
     needs = [
-        *_field_needs(config, config.active_stages),
+        *_field_needs(config),
         Need("light", _transport_bytes(config)),
         *(Need(f"capacities.{name}", _FLOAT_BYTES * n) for name, n in capacities.items()),
     ]
@@ -139,9 +136,9 @@ def require_rendering_memory(
         raise TrainingError(f"{where}: {refusal}")
 
 
-def _field_needs(config: Config, stages: tuple[Stage, ...]) -> list[Need]:
+def _field_needs(config: Config) -> list[Need]:
     """Count the bytes of the material field, once: its tables and its heads."""
-    outputs = max((stage.transport.indirect_outputs for stage in stages), default=0)
+    outputs = max((stage.transport.indirect_outputs for stage in config.active_stages), default=0)
     field = jax.eval_shape(
         lambda key: init_materials(key, config.material, indirect_outputs=outputs),
         jax.random.key(0),

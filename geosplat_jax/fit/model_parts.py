@@ -36,7 +36,7 @@ class Part(abc.ABC):
         by hand, the part stays as it is.
     needs : names of the parts that it needs; they are added with it.
     follows : names of the parts without which it is not tried.
-    is_photographed : whether photographs under one light can show that it is missing.
+    shows_in_photographs : whether photographs under one light can show that it is missing.
     """
 
     name: ClassVar[str]
@@ -44,7 +44,7 @@ class Part(abc.ABC):
     settings: ClassVar[tuple[str, ...]]
     needs: ClassVar[tuple[str, ...]] = ()
     follows: ClassVar[tuple[str, ...]] = ()
-    is_photographed: ClassVar[bool] = True
+    shows_in_photographs: ClassVar[bool] = True
 
     @abc.abstractmethod
     def removed(self, config: Config) -> Config:
@@ -54,7 +54,7 @@ class Part(abc.ABC):
         """Whether the settings have the part."""
         return self.removed(config) != config
 
-    def is_set(self, paths: Iterable[str]) -> bool:
+    def is_decided_by(self, paths: Iterable[str]) -> bool:
         """Whether one of the settings at these paths decides the part."""
         return any(fnmatchcase(path, pattern) for path in paths for pattern in self.settings)
 
@@ -124,7 +124,7 @@ class Shadows(Part):
         "stages.*.transport.occlusion",
         "stages.*.domain.points",
     )
-    is_photographed = False
+    shows_in_photographs = False
 
     def removed(self, config: Config) -> Config:
         """Give every stage the split sum."""
@@ -185,6 +185,7 @@ class FinerHash(Part):
         """
         grid = config.material.grid
         finest = max(grid.coarsest, grid.finest // 4)
+        # A line of the finest grid may take at most half of the table, see `HashGridSpec`.
         smaller_grid = replace(
             grid,
             levels=max(1, round(0.75 * grid.levels)),
@@ -252,7 +253,7 @@ def offered_parts(config: Config, by_hand: Collection[str] = ()) -> tuple[Part, 
     by_hand : paths of the settings that were set by hand.
     """
     present_parts = [part for part in LADDER if part.is_in(config)]
-    decided_names = {part.name for part in present_parts if part.is_set(by_hand)}
+    decided_names = {part.name for part in present_parts if part.is_decided_by(by_hand)}
     for part in reversed(present_parts):  # what is needed stands before what needs it
         if part.name in decided_names:
             decided_names.update(part.needs)

@@ -12,7 +12,10 @@ from geosplat_jax.pipeline import Pipeline
 from geosplat_jax.render import Params
 
 _HEADROOM = 1.2
+"""Ratio of a first size to the need."""
+
 _SPLATS_PER_QUAD = 24
+"""Four triangles per quad, six splats per triangle."""
 
 
 class TrainingError(RuntimeError):
@@ -40,6 +43,7 @@ def plan_capacities(
     """
     surface_sizes = pipeline.surface.first_capacities(params.geometry)
     splats = _SPLATS_PER_QUAD * surface_sizes["quads"]
+    # Usual needs per splat of an isosurface. A mesh has no quads; its own sizes replace these.
     guess = Capacities(
         visible=capacity_module.bucket(int(0.5 * splats)),
         hits=capacity_module.bucket(int(1.7 * splats)),

@@ -16,7 +16,6 @@ from geosplat_jax.deferred import PerPixel
 from geosplat_jax.fit.config import (
     Config,
     Rate,
-    RunSettings,
     Stage,
     config_from_dict,
     merge,
@@ -161,7 +160,6 @@ def _original(
         material=replace(material, shared=False, position_gradient=True),
         light=LightSpec(height=256, width=512),
         raster=RasterSettings(cull_backfaces=False),
-        run=RunSettings(),
         stages=stages,
     )
 
@@ -357,8 +355,8 @@ _MESH_WEIGHTS["code"] = _MESH_WEIGHTS["paper"]
 not known."""
 
 _MESH_EDGES = {"draft": 3.0, "standard": 2.0, "high": 1.5}
-"""Mean edge length of a mesh in pixels, by quality level; between two levels, that of
-`standard`."""
+"""Mean edge length of a mesh in pixels, by quality level; `between_qualities` interpolates between
+them. Settings between two levels that get their mesh only afterwards have that of `standard`."""
 
 _MESH_SHIFT_LOGIT = -1.0
 """Logit from which the inward shift of splats starts on a mesh: about a quarter of the square root

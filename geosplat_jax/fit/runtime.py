@@ -1,6 +1,8 @@
 """How this process uses the machine: compiled programs, threads and memory.
 
-Called by commands and benchmarks, never on import: a library must not change its host process.
+Nothing here runs on import. `enable_compilation_cache` changes settings of the whole process, so
+only commands, scripts and tests call it; `release_programs_when_crowded` clears the compiled
+programs of the whole process during a training.
 """
 
 import hashlib

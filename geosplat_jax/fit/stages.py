@@ -25,8 +25,8 @@ from geosplat_jax.surface.base import SurfaceModel
 from geosplat_jax.transport.environment import init_light
 
 START_STREAM = 2**31 + 1
-"""Random stream of the first parameters. Steps use the streams from 0 on, as do keys that are
-split."""
+"""Random stream of the first parameters. Steps use the streams from 0 on, and so does
+`jax.random.split`, hence this large number."""
 
 _STAGE_STREAM = 2**31
 """Random streams of the starts of stages count down from here."""
@@ -150,8 +150,8 @@ def begin_stage(params: Params, pipeline: Pipeline, config: Config, stage: Stage
     number = config.active_stages.index(stage)
     key = jax.random.fold_in(jax.random.key(config.run.seed), _STAGE_STREAM - number)
     old_transport, new_transport = config.active_stages[number - 1].transport, stage.transport
-    goes_on = old_transport.blocked_light == new_transport.blocked_light
-    indirect = IndirectHead(new_transport.indirect_outputs, goes_on)
+    keeps_meaning = old_transport.blocked_light == new_transport.blocked_light
+    indirect = IndirectHead(new_transport.indirect_outputs, keeps_meaning)
     return enter_stage(params, pipeline, stage.enter, stage.splats, indirect, key)
 
 

@@ -13,8 +13,8 @@ from geosplat_jax.io.start_mesh import StartMesh, fitted
 from geosplat_jax.surface.base import SurfaceModel
 from geosplat_jax.surface.triangle_mesh import PENALTIES, TriangleMesh, VertexOffsets
 
-_FACES_PER_PIXEL = 2.5
-"""Faces for each square of one edge length that fits into a view. The object is taken to fill a
+_FACES_PER_SQUARE = 2.5
+"""Faces per square of side one mean edge length in a view. The object is taken to fill a
 third of the view, and to have a surface about three times as large as its silhouette."""
 
 _SIZES = ("home", "faces", "edges", "neighbours", "wings")
@@ -50,7 +50,7 @@ class MeshSettings(SurfaceSettings, kind="mesh"):
 
     def expected_splats(self, pixels: float) -> int:
         """Estimate the number of splats from the pixels of a view and the edge length in pixels."""
-        faces = min(_FACES_PER_PIXEL * pixels / self.edge_pixels**2, float(self.max_faces))
+        faces = min(_FACES_PER_SQUARE * pixels / self.edge_pixels**2, float(self.max_faces))
         return SPLATS_PER_FACE * round(faces)
 
     def mesh(self, dataset: Dataset) -> StartMesh:

@@ -229,6 +229,9 @@ def fit(
         If the settings need more memory than there is, the memory runs out, a number is not finite,
         the surface explodes or vanishes too often, the run to resume or to take over does not fit,
         or the hosts were given different arguments.
+    CheckpointError
+        If a checkpoint cannot be written after steps were made, or the one to continue from is
+        damaged or does not fit.
     Interrupted
         After Ctrl-C or SIGTERM; the run can be resumed.
     """
@@ -243,7 +246,7 @@ def fit(
             devices.together(lambda: _require_possible(dataset, config))
             _require_agreement(devices, config, dataset, begin, stop_after)
             devices.together(lambda: stack.enter_context(run.locked()) if is_writer else None)
-            if not devices.first_host(begin.goes_on(run)):
+            if not devices.first_host(begin.continues(run)):
                 devices.together(lambda: is_writer and run.require_free(replace=begin.replace))
                 loop = devices.together(lambda: begin.first_loop(dataset, config, run, devices))
                 budget = None if pacer is None else pacer.budget

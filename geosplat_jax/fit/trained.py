@@ -159,7 +159,7 @@ def _checkpoints(run: RunFolder, stage: str | None) -> Path:
     return run.end_of(stage)
 
 
-def taken_over(run: RunFolder, stage: str) -> str:
+def taken_over_message(run: RunFolder, stage: str) -> str:
     """Say why a run that has passed a stage does not hold its end."""
     return (
         f"{run} holds no checkpoint of the end of {stage}, since it took this stage over from "
@@ -191,7 +191,7 @@ def load_trained(folder: str | Path | RunFolder, *, stage: str | None = None) ->
     if path is None and stage is not None and last_path is not None:
         config = run.config()
         if read_step(last_path) > config.first_step(stage) + config.stage(stage).steps:
-            raise TrainingError(taken_over(run, stage))
+            raise TrainingError(taken_over_message(run, stage))
         raise TrainingError(
             f"the stage {stage} of {run} has not ended yet; continue the training with --resume, "
             "or leave the stage out"
@@ -208,6 +208,8 @@ def load_trained(folder: str | Path | RunFolder, *, stage: str | None = None) ->
     current = config.stage(description.stage)
     step = int(tree["state"].step)
     pipeline = build_pipeline(config, current, tree["surface"])
+    # Only the weights are those of the last step: the splats are the stage's own, even if that step
+    # sampled vertices.
     weights = pipeline_at(
         pipeline, config, current, max(step - config.first_step(current.name) - 1, 0)
     ).weights

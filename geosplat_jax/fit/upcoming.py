@@ -29,7 +29,7 @@ from geosplat_jax.splats.tiles import LIST_BUFFERS
 
 
 @dataclass(frozen=True)
-class Ends:
+class PresentStage:
     """The present stage, whose end is near.
 
     Attributes
@@ -76,15 +76,15 @@ class Upcoming:
     Parameters
     ----------
     stage : the next stage.
-    ends : the present stage.
+    present : the present stage.
     known : what a checkpoint said about the next stage, in a run that was resumed.
     """
 
-    def __init__(self, stage: Stage, ends: Ends, known: NextStage | None) -> None:
+    def __init__(self, stage: Stage, present: PresentStage, known: NextStage | None) -> None:
         self.stage = stage
         self._is_wanted = True
-        config, views, present_pipeline = ends.config, ends.views, ends.pipeline
-        params, devices = ends.params, ends.devices
+        config, views, present_pipeline = present.config, present.views, present.pipeline
+        params, devices = present.params, present.devices
 
         def first_pipeline(capacities: Capacities) -> Pipeline:
             pipeline = pipeline_at(
@@ -97,7 +97,7 @@ class Upcoming:
                 return Capacities(**known.capacities)
             first_params = begin_stage(params, present_pipeline, config, stage)
             pipeline = first_pipeline(Capacities())
-            carried_capacities = continued(present_pipeline, ends.needed, pipeline, stage)
+            carried_capacities = continued(present_pipeline, present.needed, pipeline, stage)
             if carried_capacities is not None:
                 return add_rays(pipeline, first_params, carried_capacities)
             return plan_capacities(

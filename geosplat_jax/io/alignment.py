@@ -73,8 +73,8 @@ def align_world(
     Parameters
     ----------
     camera_to_world : OpenGL axes (x right, y up, z backwards), rigid, in any world.
-    points : points of the scene in that world. Their median distance from the cameras is what the
-        movement of the cameras is compared with.
+    points : points of the scene in that world. Their median distance from the mean position of the
+        cameras is what the movement of the cameras is compared with.
 
     Raises
     ------
@@ -147,8 +147,9 @@ def require_spread(centers: np.ndarray, points: np.ndarray) -> None:
     distance = float(np.median(np.linalg.norm(points - middle, axis=1)))
     if not spread[0] > _SMALLEST_SPREAD * distance:
         raise AlignmentError(
-            f"all photographs were taken from about one point (they are {spread[0] / distance:.1%} "
-            "of the distance to the scene apart); walk around the object"
+            "all photographs were taken from about one point (the standard deviation of "
+            f"their positions is {spread[0] / distance:.1%} of the distance to the scene); walk "
+            "around the object"
         )
     if not spread[1] > _FLATTEST * spread[0]:
         raise AlignmentError(

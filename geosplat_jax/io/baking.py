@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 
 from geosplat_jax.io.extras import optional_package
-from geosplat_jax.io.meshes import facing
+from geosplat_jax.io.meshes import doubled_area_normals
 
 # Faces of the fine mesh whose nearest point is computed: those with the nearest centres.
 _CANDIDATES = 8
@@ -97,7 +97,7 @@ class FineSurface:
         """
         middle, scale = _middle_and_scale(np.asarray(self.vertices, np.float64))
         corners = ((self.vertices - middle) * scale)[self.faces]
-        outward = facing(corners)
+        outward = doubled_area_normals(corners)
         tree = KDTree(corners.mean(axis=1))
         count = min(_CANDIDATES, len(self.faces))
         positions, normals = np.empty((2, len(points), 3), np.float32)

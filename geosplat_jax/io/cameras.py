@@ -209,8 +209,8 @@ def with_cameras(views: Views, split: RefinedSplit, where: str) -> Views:
     missing = [name for name in views.names if name not in split.cameras]
     if missing:
         raise SceneError(
-            f"{where} has no camera for {len(missing)} of {len(views)} views, {missing[0]!r} for "
-            "one; refine the cameras of this scene"
+            f"{where} has no camera for {len(missing)} of {len(views)} views, for example "
+            f"{missing[0]!r}; refine the cameras of this scene"
         )
     cameras = [split.cameras[name] for name in views.names]
     exposure = np.array([camera.exposure for camera in cameras])

@@ -1,7 +1,7 @@
 """Checkpoints: a pytree of arrays in one ``.npz`` file, exact to the bit and without pickle.
 
-Each leaf is a member named by its path in the tree (``['params'].geometry.sdf.npy``); one more
-member holds JSON: the step, the caller's metadata, and each leaf's shape and type. Types that
+Each leaf is a member named by its path in the tree (``['state'].params.geometry.sdf.npy``); one
+more member holds JSON: the step, the caller's metadata, and each leaf's shape and type. Types that
 NumPy does not know (bfloat16) are stored as unsigned integers, typed PRNG keys as their data and
 the name of their generator. A file is written under another name, flushed to the disk and read
 back; only then is it renamed, and older ones are removed. So there is a whole checkpoint at any
@@ -259,7 +259,7 @@ def _require_same_leaves(path: Path, stored_names: set[str], expected_names: set
     if missing or extra:
         clauses = [
             f"{verb} {len(names)} leaves ({', '.join(names[:3])}{', ...' if names[3:] else ''})"
-            for verb, names in (("lacks", missing), ("has besides", extra))
+            for verb, names in (("lacks", missing), ("also has", extra))
             if names
         ]
         raise CheckpointError(

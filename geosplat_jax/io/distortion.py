@@ -13,9 +13,10 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
+from geosplat_jax.io.images import straight
+
 _SAMPLES = 4096  # radii at which a polynomial is evaluated to find where it decreases
 _WHOLE = 1.0 - 1e-3  # least weight of pixels that count in a sample that counts
-_SMALLEST_ALPHA = 1e-6
 _ROWS_AT_ONCE = 16
 _INVERSIONS = 60
 _INVERTED = 0.02  # largest error of an inverted lens, in pixels
@@ -214,9 +215,7 @@ def resample_at(
         rows = slice(start, start + _ROWS_AT_ONCE)
         strip = _bilinear(pixels_at, shape, lookup.rows[rows], lookup.columns[rows])
         if shape[-1] == 4:
-            is_covered = strip[..., 3:] > _SMALLEST_ALPHA
-            divisor = np.where(is_covered, strip[..., 3:], 1.0)
-            strip[..., :3] = np.where(is_covered, strip[..., :3] / divisor, 0.0)
+            strip[..., :3] = straight(strip[..., :3], strip[..., 3])
         samples[rows] = np.where(lookup.inside[rows, :, None], strip, 0.0)
     return samples
 

@@ -28,7 +28,7 @@ from geosplat_jax.io.images import encode_srgb, write_exr, written_aside
 from geosplat_jax.io.memory import Need, memory_refusal
 from geosplat_jax.io.meshes import (
     Y_UP_LINE,
-    facing,
+    doubled_area_normals,
     fill_gutters,
     is_closed,
     nondegenerate,
@@ -105,8 +105,8 @@ def _textures(materials: Float[np.ndarray, "S S 5"]) -> tuple[Image.Image, Image
 
 def _agrees(vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray) -> bool:
     """Whether vertex normals point to the front of the faces, in the mean weighted by area."""
-    a, b, c = np.moveaxis(np.asarray(vertices, np.float64)[faces], 1, 0)
-    return bool(np.sum(np.cross(b - a, c - a) * normals[faces].sum(1)) >= 0)
+    fronts = doubled_area_normals(np.asarray(vertices, np.float64)[faces])
+    return bool(np.sum(fronts * normals[faces].sum(1)) >= 0)
 
 
 def _checked_mesh(
@@ -305,7 +305,7 @@ def _textured(
     points = np.einsum("nk,nkd->nd", weights, cut_vertices[rows]).astype(np.float32)
     attributes, normal_map = {}, None
     if fine is not None:
-        points, fine_normals = fine.nearest(points, facing(cut_vertices[rows]))
+        points, fine_normals = fine.nearest(points, doubled_area_normals(cut_vertices[rows]))
         tangents = vertex_tangents(cut_vertices, charts.faces, cut_normals, charts.uv)
         interpolated = (np.einsum("nk,nkd->nd", weights, x[rows]) for x in (cut_normals, tangents))
         normal_map = _normal_map(in_tangent_space(fine_normals, *interpolated), is_covered)
@@ -432,7 +432,7 @@ def export_mesh_glb(
         vertices, faces = simplified(vertices, faces, face_count)
         faces = faces[nondegenerate(vertices, faces)]
         normal_sums = np.zeros(vertices.shape)
-        np.add.at(normal_sums, faces, facing(vertices[faces])[:, None])
+        np.add.at(normal_sums, faces, doubled_area_normals(vertices[faces])[:, None])
         normals = fine.nearest(vertices, normal_sums)[1]
         info["closed"] = is_closed(faces)
     double_sided = not info["closed"]

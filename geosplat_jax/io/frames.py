@@ -218,7 +218,7 @@ def opengl_pose(
     pose = np.eye(4)
     # The pose is inverted after the check, which reports a singular one.
     pose[:3, :3], pose[:3, 3] = rotation, translation
-    rigid = checked_pose(pose, where)
+    rigid = checked_pose(pose, where, axes="x right, y down, z forward")
     camera_to_world = np.eye(4)
     camera_to_world[:3, :3] = rigid[:3, :3].T
     camera_to_world[:3, 3] = -rigid[:3, :3].T @ rigid[:3, 3]
@@ -240,10 +240,18 @@ def quaternion_to_rotation(
     return Rotation.from_quat(np.roll(quaternion, -1)).as_matrix()
 
 
-def checked_pose(matrix: Any, where: str) -> Float[np.ndarray, "4 4"]:
-    """Check a camera-to-world matrix, and return it as an exactly rigid transform.
+def checked_pose(
+    matrix: Any, where: str, *, axes: str = "x right, y up, z backwards"
+) -> Float[np.ndarray, "4 4"]:
+    """Check a rigid 4 x 4 pose, and return it as an exactly rigid transform.
 
     Deviations up to 1e-3, as rounding leaves them, are repaired by taking the nearest rotation.
+
+    Parameters
+    ----------
+    matrix : the pose, in either direction.
+    where : where the pose stands, for messages.
+    axes : axes that the camera should have, for messages.
 
     Raises
     ------
@@ -271,8 +279,8 @@ def checked_pose(matrix: Any, where: str) -> Float[np.ndarray, "4 4"]:
     rotation = left @ right
     if np.linalg.det(rotation) < 0.0:
         raise SceneError(
-            f"the pose of {where} mirrors space (determinant -1); negate one column, or convert "
-            "the axes to x right, y up, z backwards"
+            f"the pose of {where} mirrors space (determinant -1); negate one axis of the camera, "
+            f"or convert its axes to {axes}"
         )
     rigid = np.eye(4)
     rigid[:3, :3], rigid[:3, 3] = rotation, pose[:3, 3]

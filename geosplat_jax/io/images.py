@@ -171,7 +171,7 @@ def wide_color_profile(path: str | Path) -> str | None:
 
 
 def read_image(path: str | Path) -> Float[np.ndarray, "H W C"]:
-    """Read an image as stored: no transfer curve, no premultiplication.
+    """Read an image without decoding its transfer curve; alpha is as `read_stored` returns it.
 
     Integer formats are scaled to [0, 1]; float formats keep their values, NaN included.
 

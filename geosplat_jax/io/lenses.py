@@ -185,7 +185,9 @@ def _checked_distortion(values: Mapping[str, Any], where: str) -> Distortion | N
     )
     if model in _FISHEYE_MODELS:
         if p1 or p2:
-            raise SceneError(f"{where} has p1 or p2, which a fisheye lens has not; remove them")
+            raise SceneError(
+                f"{where} has p1 or p2, which a fisheye lens does not have; remove them"
+            )
         return Fisheye((k1, k2, k3, k4))
     return Brown((k1, k2, k3, k4), (p1, p2)) if any((k1, k2, k3, k4, p1, p2)) else None
 
@@ -195,9 +197,11 @@ def _is_number(value: Any) -> bool:
 
 
 def checked_coefficient(value: Any, key: str, where: str) -> float:
-    """Check a coefficient of distortion, a finite number of either sign; `SceneError` otherwise."""
+    """Check a number of either sign, a distortion or a principal point; `SceneError` otherwise."""
     if not _is_number(value) or not abs(value) < _LONGEST:
-        raise SceneError(f"{key!r} of {where} must be a finite number, got {value!r}")
+        raise SceneError(
+            f"{key!r} of {where} must be a finite number below {_LONGEST:g} in size, got {value!r}"
+        )
     return float(value)
 
 
@@ -207,7 +211,9 @@ def checked_length(value: Any, key: str, where: str) -> float:
     # Compared before it is converted, because an integer of JSON may be too large for a float.
     if not _is_number(value) or not 0 < value < _LONGEST or (is_size and value != int(value)):
         kind = "a positive whole number" if is_size else "a positive number"
-        raise SceneError(f"{key!r} of {where} must be {kind} of pixels, got {value!r}")
+        raise SceneError(
+            f"{key!r} of {where} must be {kind} of pixels below {_LONGEST:g}, got {value!r}"
+        )
     return float(value)
 
 

@@ -325,8 +325,8 @@ def signed_volume(vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 
 
 def surface_area(vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> float:
     """Total area of the faces."""
-    a, b, c = np.moveaxis(np.asarray(vertices, np.float64)[faces], 1, 0)
-    return float(0.5 * np.sqrt((np.cross(b - a, c - a) ** 2).sum(-1)).sum())
+    normals = doubled_area_normals(np.asarray(vertices, np.float64)[faces])
+    return float(0.5 * np.sqrt((normals**2).sum(-1)).sum())
 
 
 def longest_edge(vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> float:
@@ -510,7 +510,7 @@ def first_hits(
     return face_rows, pixel_weights
 
 
-def facing(corners: Float[np.ndarray, "N 3 3"]) -> Float[np.ndarray, "N 3"]:
+def doubled_area_normals(corners: Float[np.ndarray, "N 3 3"]) -> Float[np.ndarray, "N 3"]:
     """Return the normals of triangles, on their front, with twice their area as length."""
     return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
 
@@ -521,7 +521,7 @@ def sides(
     """Tell which side of faces one view (V = 1) sees: 1 the front, -1 the back or the edge."""
     corners = np.asarray(vertices, np.float64)[faces]
     from_camera = corners[:, 0] - np.asarray(camera.centers[0], np.float64)
-    return np.where((facing(corners) * from_camera).sum(axis=-1) < 0, 1.0, -1.0)
+    return np.where((doubled_area_normals(corners) * from_camera).sum(axis=-1) < 0, 1.0, -1.0)
 
 
 def render_mesh_normals(

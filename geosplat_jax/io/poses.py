@@ -182,7 +182,7 @@ def _photographs(root: Path) -> list[str]:
         # COLMAP reads pairs of names, divided by a space, and skips names that it does not know.
         raise SceneError(
             f"{len(bad_names)} photographs in {folder} have a space in their name or begin with #, "
-            f"{bad_names[0]!r} for one, which COLMAP cannot match; rename them"
+            f"for example {bad_names[0]!r}, which COLMAP cannot match; rename them"
         )
     stems = Counter("_".join(Path(name).with_suffix("").parts) for name in names)
     stem, count = stems.most_common(1)[0]
@@ -267,7 +267,7 @@ class _Matches(NamedTuple):
             )
         if 2 * self.pairs / self.photographs < _FEW_PARTNERS:
             return (
-                f"{said}: they show little of the same ({self.pairs} of {self.compared} pairs "
+                f"{said}: they overlap too little ({self.pairs} of {self.compared} pairs "
                 "match); take more of them, with steps of about ten degrees around the object"
             )
         return (

@@ -81,15 +81,18 @@ class StartMesh:
 
         Unlike in `meshes.is_closed`, four faces may meet at an edge.
         """
-        return not _open_edges(self.faces).any()
+        return not _edge_balances(self.faces).any()
 
     def noting(self, *notes: str, **changes: Any) -> "StartMesh":
         """Return the mesh with changes of its fields, and notes about them."""
         return replace(self, notes=(*self.notes, *notes), **changes)
 
 
-def _open_edges(faces: Int[np.ndarray, "F 3"]) -> Int[np.ndarray, " E"]:
-    """Return, for every edge, the difference between its numbers of uses in the two directions."""
+def _edge_balances(faces: Int[np.ndarray, "F 3"]) -> Int[np.ndarray, " E"]:
+    """Return, for every edge, the difference between its numbers of uses in the two directions.
+
+    Its parity is that of their sum, the number of faces at the edge.
+    """
     start, end = faces.astype(np.int64), np.roll(faces, -1, axis=1).astype(np.int64)
     stride = int(faces.max(initial=0)) + 1
     edge = np.minimum(start, end) * stride + np.maximum(start, end)
@@ -100,7 +103,7 @@ def _open_edges(faces: Int[np.ndarray, "F 3"]) -> Int[np.ndarray, " E"]:
 
 def _has_border(faces: Int[np.ndarray, "F 3"]) -> bool:
     """Tell whether some edge belongs to an odd number of faces, however they are oriented."""
-    return bool((_open_edges(faces) % 2).any())
+    return bool((_edge_balances(faces) % 2).any())
 
 
 def digest_of(path: str | Path) -> str:

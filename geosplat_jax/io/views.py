@@ -138,7 +138,7 @@ class Views:
 
     @cached_property
     def valid_counts(self) -> Float[np.ndarray, " V"]:
-        """Count the pixels of each view that count."""
+        """Number of valid pixels of each view."""
         if self.valid is None:
             return np.full(len(self), float(self.height * self.width))
         return np.array([float(np.count_nonzero(valid)) for valid in self.valid])

@@ -25,7 +25,7 @@ from geosplat_jax.render import Asset
 from geosplat_jax.report.gallery import FOLDER
 from geosplat_jax.report.light_metrics import resize_light
 from geosplat_jax.report.pace import OnProgress
-from geosplat_jax.report.renderer import Renderer, build_asset
+from geosplat_jax.report.renderer import Renderer, build_asset, exposed_radiance
 
 _MATERIAL_CHUNK = 65_536
 
@@ -186,12 +186,9 @@ def export_assets(
     }
     albedo = np.asarray(asset.attributes.materials.albedo)[:count]
     export_gaussians_ply(folder / "gaussians.ply", rgb=encode_srgb(albedo), **rows)
-    # Exposed, so that mesh and light together are as bright as the photographs.
-    radiance = np.asarray(trained.params.light.radiance) * np.exp(
-        float(trained.params.log_exposure)
-    )
+    radiance = exposed_radiance(trained.params)
     export_light_exr(folder / "light.exr", radiance)
-    height, width = trained.params.light.radiance.shape[:2]
+    height, width = radiance.shape[:2]
     others = {str(folder / "mesh.obj"): "the same mesh, with mesh.mtl and PNG"} if obj else {}
     if usd:
         others[str(folder / "mesh.usdc")] = "the same mesh, with PNG"

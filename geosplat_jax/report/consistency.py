@@ -58,10 +58,10 @@ class Consistency:
     reflection_deg : angle between the reflected directions, degrees.
     distance : absolute difference of the distances, as a share of the box's diagonal.
     pixels : number of pixels that were compared.
-    uncovered : share of the pixels whose rays hit the mesh from outside that splats cover by at
-        most a half; they are not compared.
-    behind : share of the pixels whose rays hit the mesh that see the back of a face; they are not
-        compared.
+    uncovered : of the pixels whose rays hit the mesh from outside, the share that splats cover by
+        at most a half; these pixels are not compared.
+    behind : of the pixels whose rays hit the mesh, the share that see the back of a face; these
+        pixels are not compared.
     """
 
     reflection_deg: float
@@ -207,19 +207,20 @@ def see_mesh(
     return SeenMesh(
         is_hit,
         image(side > 0),
-        _ray_directions(camera),
+        ray_directions(camera),
         image(_unit(hit_normals)),
         image(_length(hit_offsets)),
     )
 
 
-def _ray_directions(camera: Camera) -> Float[np.ndarray, "H W 3"]:
+def ray_directions(camera: Camera) -> Float[np.ndarray, "H W 3"]:
     """Return unit directions, in the world, of the rays through the pixel centres of a view."""
     lens, pose = (np.asarray(x[0], np.float64) for x in (camera.intrinsics, camera.world_to_camera))
     x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     camera_rays = np.stack(
         [(x - lens[0, 2]) / lens[0, 0], (y - lens[1, 2]) / lens[1, 1], x * 0 + 1], -1
     )
+    # Rows of d^T R are R^T d: from camera axes back to the world.
     return _unit(camera_rays @ pose[:3, :3])
 
 

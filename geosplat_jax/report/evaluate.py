@@ -28,6 +28,7 @@ from geosplat_jax.report.renderer import (
     DEFAULT_SAMPLES,
     RenderedView,
     Renderer,
+    exposed_radiance,
     photograph_on_white,
     render_on_white,
 )
@@ -39,7 +40,7 @@ _MATERIALS = ("roughness", "metallic")
 
 
 def _where_counted(view: RenderedView, valid: np.ndarray | None) -> RenderedView:
-    """Set pixels of a render that do not count to zero; ``valid`` is (H, W), or None for all."""
+    """Set to zero what does not count in a render; ``valid`` is (H, W), or None for all pixels."""
     if valid is None:
         return view
     mask = valid[..., None]
@@ -381,15 +382,12 @@ def _write_model(
     texture_size: int,
 ) -> dict[str, Any] | None:
     """Write the mesh with its materials, and lights to see it under; see `assets.write_model`."""
-    exposed_radiance = np.asarray(trained.params.light.radiance) * np.exp(
-        float(trained.params.log_exposure)
-    )
     maps = {name: np.asarray(light.radiance) for name, light in lights.items()}
     return write_model(
         folder,
         sheets.mesh,
         sampler,
-        lights={"reconstructed light": exposed_radiance} | maps,
+        lights={"reconstructed light": exposed_radiance(trained.params)} | maps,
         eye=sheets.views.camera_to_world[0, :3, 3],
         texture_size=texture_size,
     )

@@ -42,8 +42,8 @@ class EventLog(Listener):
         if self._writer is not None:
             self._writer.close()
         self._writer = None
-        self._file: int | None = None
-        self._read = 0
+        self._inode: int | None = None
+        self._bytes_read = 0
         self._shown: set[str] = set()
 
     def on_step(self, progress: Progress) -> None:
@@ -55,19 +55,19 @@ class EventLog(Listener):
         """Write what was added since the last call, or everything if ``metrics.jsonl`` is new."""
         if not self._folder.metrics.exists():
             return
-        file = self._folder.metrics.stat().st_ino
-        if self._file not in (None, file):
+        inode = self._folder.metrics.stat().st_ino
+        if self._inode not in (None, inode):
             self._begin_anew()
-        self._file = file
+        self._inode = inode
         if self._writer is None:
             target = self._folder.path / EVENTS
             shutil.rmtree(target, ignore_errors=True)
             self._writer = self._kind(logdir=str(target))
-        with self._folder.metrics.open("rb") as file:
-            file.seek(self._read)
-            new_bytes = file.read()
+        with self._folder.metrics.open("rb") as stream:
+            stream.seek(self._bytes_read)
+            new_bytes = stream.read()
         whole_lines = new_bytes[: new_bytes.rfind(b"\n") + 1]
-        self._read += len(whole_lines)
+        self._bytes_read += len(whole_lines)
         for text in whole_lines.splitlines():
             self._write_step(json.loads(text))
         for path in sorted(self._folder.previews.glob("step_*.png")):

@@ -326,8 +326,8 @@ def new_view_metrics(
 
     Parameters
     ----------
-    rgb : (H, W, 3) linear, exposed and tone mapped, premultiplied by ``alpha``; clipped here. For a
-        `ObjectRendition` it must not be tone mapped, since colours brighter than white are
+    rgb : (H, W, 3) linear, exposed and tone mapped, premultiplied by ``alpha``; clipped here. For
+        an `ObjectRendition` it must not be tone mapped, since colours brighter than white are
         compared too.
     alpha : (H, W) predicted coverage.
     image : (H, W, 4) photograph, linear, *straight* alpha, which is the mask.
@@ -337,7 +337,7 @@ def new_view_metrics(
     Returns
     -------
     ``nvs.psnr`` (dB) and ``nvs.ssim`` of the whole image; ``nvs.psnr_masked`` and
-    ``nvs.ssim_masked`` over the pixels of the mask, unless it is empty. For a
+    ``nvs.ssim_masked`` over the pixels of the mask, unless it is empty. For an
     `ObjectRendition` its figures, such as ``nvs.psnr_h``, if the eroded mask is not empty.
 
     Raises
@@ -464,7 +464,7 @@ def relight_metrics(
     ----------
     protocol : protocol whose ``relight`` is used.
     rgb : (V, H, W, 3) linear, premultiplied by ``alpha``, rendered with the albedo times its
-        `albedo_scale` at exposure 1; clipped here. For a `ObjectRendition` it must not be tone
+        `albedo_scale` at exposure 1; clipped here. For an `ObjectRendition` it must not be tone
         mapped.
     alpha : (V, H, W) predicted coverage.
     image : (V, H, W, 4) true image, linear, *straight* alpha, which is the mask.

@@ -22,7 +22,7 @@ from geosplat_jax.io.images import (
 )
 from geosplat_jax.io.movies import check_movie, has_encoder, write_movie
 from geosplat_jax.io.views import ViewLight
-from geosplat_jax.report.consistency import resized
+from geosplat_jax.report.consistency import ray_directions, resized
 from geosplat_jax.report.light_metrics import resize_light
 from geosplat_jax.report.pace import OnProgress, counted
 from geosplat_jax.report.renderer import RenderedView, Renderer, to_picture
@@ -119,12 +119,7 @@ def turned(light: EnvLight, angle: float) -> EnvLight:
 
 def _behind(camera: Camera, light: EnvLight) -> np.ndarray:
     """Render the environment light as seen by a single camera, (H, W, 3) linear."""
-    x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
-    inverse = np.linalg.inv(np.asarray(camera.intrinsics[0], np.float64))
-    rays = np.stack([x, y, np.ones_like(x)], axis=-1) @ inverse.T
-    # Rows of d^T R are R^T d: from camera axes back to the world.
-    rays = rays @ np.asarray(camera.world_to_camera[0, :3, :3], np.float64)
-    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+    rays = ray_directions(camera)
     colors = _lookup(light.radiance, jnp.asarray(rays.reshape(-1, 3), jnp.float32))
     return np.asarray(colors).reshape(camera.height, camera.width, 3)
 

@@ -107,13 +107,19 @@ def build_asset(pipeline: Pipeline, params: Params) -> Asset:
     return capacity_module.retry(attempt, Capacities(**guess))[0]
 
 
+def exposed_radiance(params: Params) -> np.ndarray:
+    """Radiance of the light times the learned exposure, (H, W, 3), as bright as the photographs."""
+    return np.asarray(params.light.radiance) * np.exp(float(params.log_exposure))
+
+
 def relight_transport(indirect: str = "traced") -> MonteCarloSettings | PathSettings:
     """Return the light transport under a new light.
 
-    Indirect light that was learned in training does not hold under a new light. By ``indirect``,
-    blocked directions bring instead light that is looked up at the face that is hit (``traced``),
-    light of paths with as many bounces (``paths``), or none (``none``). Without shadows
-    (``unshadowed``) no rays are traced, and a splat is only blocked by its own face.
+    Indirect light that was learned in training does not hold under a new light. Where a direction
+    is blocked, ``indirect`` says what arrives instead: ``traced``, light looked up at the face that
+    is hit; ``paths``, light along paths with `RELIGHT_BOUNCES` bounces between surfaces, as many as
+    ``traced`` has; ``none``, nothing. With ``unshadowed`` no rays are traced, and a splat is only
+    blocked by its own face.
 
     Raises
     ------
@@ -359,7 +365,7 @@ class Renderer:
         return output
 
     def __call__(self, camera: Camera) -> RenderedView:
-        """Render the single view of ``camera``, with every AOV of the evaluation."""
+        """Render the single view of ``camera``, with the evaluation's AOVs and `with_aovs`'s."""
         illuminations = self._illuminated()
         first_output = self._render(camera, illuminations[0], 0)
         pass_count, total = self._passes_needed(first_output), first_output.rgb[0]

@@ -87,7 +87,9 @@ def _read_camera(where: Path) -> tuple[np.ndarray, np.ndarray]:
     try:
         words = where.read_text(encoding="utf-8").split()
     except UnicodeDecodeError as error:
-        raise SceneError(f"{where} is no text ({error.reason}); write it again") from error
+        raise SceneError(
+            f"{where} is not a UTF-8 text file ({error.reason}); write it again"
+        ) from error
     matrices = []
     for name, size in (("extrinsic", 4), ("intrinsic", 3)):
         if name not in words:

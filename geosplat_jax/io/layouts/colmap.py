@@ -306,7 +306,9 @@ def _lines(path: Path) -> list[str]:
     try:
         return path.read_text(encoding="utf-8").splitlines()
     except UnicodeDecodeError as error:
-        raise SceneError(f"{path} is no text ({error.reason}); write the model again") from error
+        raise SceneError(
+            f"{path} is not a UTF-8 text file ({error.reason}); write the model again"
+        ) from error
 
 
 def _is_entry(line: str) -> bool:

@@ -42,8 +42,8 @@ def list_llff(root: Path, *, light: str | None = None) -> Listing:
     Raises
     ------
     MissingFileError : there are no images.
-    SceneError : the file is damaged or has not one row of 17 numbers for each image; there are not
-        as many masks as images; a light is asked for.
+    SceneError : the file is damaged or does not have one row of 17 numbers for each image; there
+        are not as many masks as images; a light is asked for.
     """
     require_no_light(light)
     where, images = root / FILE, images_in(root, ("images",))

@@ -133,7 +133,7 @@ def _train_light(root: Path, folders: list[Path]) -> str:
         return USUAL_TRAIN_LIGHT
     if len(lights) != 1:
         raise SceneError(
-            f"{folders[0]} has images under the lights {lights}; choose one with light=..."
+            f"{folders[0]} has images under the lights {lights}; choose one with --light"
         )
     return lights[0]
 

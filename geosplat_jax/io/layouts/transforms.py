@@ -128,8 +128,8 @@ def _names(
     unknown = [name for name in names if _plain(name) not in frames]
     if unknown:
         raise SceneError(
-            f"{key!r} of {where} names {len(unknown)} files that no frame has, {unknown[0]!r} for "
-            "one; remove them"
+            f"{key!r} of {where} names {len(unknown)} files that no frame has, for example "
+            f"{unknown[0]!r}; remove them"
         )
     return [_plain(name) for name in names]
 
