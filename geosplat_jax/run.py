@@ -43,7 +43,7 @@ from geosplat_jax.report.consistency import Consistency, body_of_run, measure, s
 from geosplat_jax.report.evaluate import EvaluateOptions, Truth, evaluate_run
 from geosplat_jax.report.facts import changed_from_preset
 from geosplat_jax.report.pace import OnProgress, counted
-from geosplat_jax.report.page import REPORT, Evaluated, write_report
+from geosplat_jax.report.page import REPORT, RunResults, write_report
 from geosplat_jax.report.protocols import PROTOCOLS
 from geosplat_jax.report.relight import RelightOptions, load_light, load_view_light, relight_views
 from geosplat_jax.report.renderer import DEFAULT_SAMPLES, Renderer
@@ -157,7 +157,7 @@ class Run:
         RunError
             If there was none, or its file is damaged.
         """
-        results = Evaluated.of(self.folder).metrics()
+        results = RunResults.of(self.folder).metrics()
         if not results:
             raise RunError(f"{self.folder} has not been evaluated; do so first")
         return results
@@ -211,7 +211,7 @@ class Run:
         trained = self.trained if stage is None else load_trained(self.folder, stage=stage)
         lights = {name: load_light(path) for name, path in dataset.lights.items()}
         peaks = [line["peak_memory_mb"] for line in self.steps() if "peak_memory_mb" in line]
-        evaluation = Evaluated.of(self.folder, stage=stage)
+        evaluation = RunResults.of(self.folder, stage=stage)
         metrics = evaluate_run(
             trained,
             Truth(views, lights, _true_light(dataset, lights), dataset.train),
@@ -246,7 +246,7 @@ class Run:
         RunError
             If a file of a run is damaged.
         """
-        runs = [Evaluated.of(run.folder) for run in (self, *others)]
+        runs = [RunResults.of(run.folder) for run in (self, *others)]
         return write_report(Path(output or self.folder.path / REPORT).expanduser(), runs)
 
     def consistency(self, *, stage: str | None = None, size: int | None = None) -> Consistency:

@@ -347,7 +347,7 @@ def test_one_small_view_has_a_finite_loss_and_gradient(size):
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_a_field_of_one_sign_has_no_surface_and_nothing_but_the_background(unit_scene, sign):
+def test_a_field_of_one_sign_has_no_surface_and_nothing_but_the_background(sign):
     rng = np.random.default_rng(1)
     count = scaled_pipeline(1.0).surface.grid.vertex_count
     params = make_params(sign * rng.uniform(1.0, 3.0, count))

@@ -212,7 +212,7 @@ def test_pixels_that_do_not_count_say_nothing(open_bowl):
     assert cut_depth < 1.0
 
 
-def test_few_views_say_too_little(open_bowl):
+def test_few_views_say_too_little():
     views = photographed(bowl, painted, count=7)
     _, hull, sdf = carved(views)
     assert sdf is hull

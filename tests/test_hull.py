@@ -22,7 +22,6 @@ pytestmark = pytest.mark.usefixtures("products_must_ask")
 
 SHARED = Path(__file__).parents[2] / "shared"
 VIEW_COUNT, SIZE, FOCAL, DISTANCE, RADIUS = 40, 64, 90.0, 4.0, 0.9
-BACKGROUND = (0.5, 0.5, 0.5)
 
 
 def cameras_around(center, *, scale=1.0, count=VIEW_COUNT):

@@ -29,7 +29,7 @@ from geosplat_jax.report.facts import (
     stage_times,
 )
 from geosplat_jax.report.gallery import comparisons, write_gallery
-from geosplat_jax.report.page import LARGEST_PAGE, Evaluated, report_html
+from geosplat_jax.report.page import LARGEST_PAGE, RunResults, report_html
 
 EVIL = "<script>alert(1)</script>\"'&"
 TRIANGLE = b"glTF\x02\x00\x00\x00"
@@ -99,7 +99,7 @@ def make_run(folder, *, name="test_000", light="noon", config=None, size=24):
         },
     }
     (folder / "metrics.json").write_text(json.dumps(metrics))
-    return Evaluated.of(RunFolder(folder))
+    return RunResults.of(RunFolder(folder))
 
 
 @pytest.fixture(scope="module")
@@ -395,7 +395,7 @@ def test_a_run_that_was_trained_further_since_its_evaluation_says_so(tmp_path):
     # A killed run has made steps since its last checkpoint, which no evaluation can see.
     for step, is_older in ((1600, False), (900, True)):
         (folder / "metrics.json").write_text(json.dumps({**metrics, "step": step}))
-        html = report_html([Evaluated.of(RunFolder(folder))])
+        html = report_html([RunResults.of(RunFolder(folder))])
         assert (f"was evaluated after {step} steps" in html) is is_older
 
 
@@ -406,7 +406,7 @@ def test_different_indirect_light_under_new_lights_is_said(tmp_path):
         metrics = json.loads((tmp_path / name / "metrics.json").read_text())
         metrics["relight_indirect"] = indirect
         (tmp_path / name / "metrics.json").write_text(json.dumps(metrics))
-        runs.append(Evaluated.of(RunFolder(tmp_path / name)))
+        runs.append(RunResults.of(RunFolder(tmp_path / name)))
     warning = "relit with different indirect light"
     assert warning not in report_html(runs[:2])
     assert warning in report_html(runs)

@@ -215,7 +215,7 @@ def test_dead_splats_go_to_live_ones_in_proportion_to_their_opacity():
     count = 4000
     splats = some_splats(count)
     row = np.arange(count)
-    opacity = np.where(row < 2, [0.6, 0.2][0], 0.001)
+    opacity = np.where(row < 2, 0.6, 0.001)
     opacity[1] = 0.2
     logits = jnp.asarray(np.log(opacity / (1 - opacity)), jnp.float32)
     splats = replace(splats, opacity_logits=logits)
@@ -290,10 +290,7 @@ def scene_views(count=9, size=32):
         rays = np.stack([x, y, -np.ones_like(x)], -1) @ pose[:3, :3].T
         rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
         color = 0.3 + 0.2 * rays
-        for ball_center, ball_color in (
-            ((0.0, 0.0, 0.0), (0.9, 0.5, 0.1)),
-            ((0.6, 0.3, 0.2), (0.1, 0.3, 0.9)),
-        ):
+        for ball_center, ball_color in BALLS:
             offset = pose[:3, 3] - np.asarray(ball_center)
             projections = rays @ offset
             is_hit = projections**2 - offset @ offset + 0.45**2 > 0

@@ -299,7 +299,7 @@ def test_radiance_that_is_not_radiance_is_refused(tmp_path, monkeypatch, value):
         load_light(path)
 
 
-def test_a_little_negative_radiance_is_set_to_zero(tmp_path, monkeypatch):
+def test_a_little_negative_radiance_is_set_to_zero(monkeypatch):
     """As filters leave it that resized the map."""
     pixels = np.full((4, 8, 3), 100.0, np.float32)
     pixels[1, 2] = -1.0
@@ -332,7 +332,7 @@ def test_an_image_of_eight_bits_is_taken_as_srgb(tmp_path):
     np.testing.assert_allclose(radiance, (0.502 + 0.055) ** 2.4 / 1.055**2.4, atol=1e-3)
 
 
-def test_movies_that_cannot_be_written_are_refused_before_anything_is_rendered(tmp_path):
+def test_movies_that_cannot_be_written_are_refused_before_anything_is_rendered():
     options = RelightOptions(turntable=3, suffix=".gif", frames_per_second=60.0)
     with pytest.raises(SceneError, match="50 frames per second, got 60"):
         options.check()

@@ -72,7 +72,7 @@ def test_what_no_scene_is_read_with_is_refused(folder):
     assert not (folder / "refused").exists()
 
 
-def test_a_preview_that_fails_is_told_of_and_ends_nothing(tmp_path, monkeypatch):
+def test_a_preview_that_fails_is_told_of_and_ends_nothing(tmp_path):
     previews = run_module._Previews(sphere_dataset(count=2, size=8), RunFolder(tmp_path))
 
     def failing():

@@ -359,7 +359,7 @@ def test_a_strange_run_is_rendered_and_relit(dataset, run):
     assert relit.rgb.max() > 0
 
 
-def test_rays_shade_the_mesh_as_they_shade_the_isosurface(run):
+def test_rays_shade_the_mesh_as_they_shade_the_isosurface():
     """Brute force and the grid find the same hits on one surface."""
     grid = fit_grid((np.full(3, -0.6), np.full(3, 0.6)), 8)
     model = FlexiCubes(grid)

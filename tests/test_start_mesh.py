@@ -144,7 +144,7 @@ def test_an_open_mesh_is_wound_alike_where_that_is_possible(tmp_path):
 
 
 @pytest.mark.parametrize("jitter", [1e-10, 1e-8, 2e-7])
-def test_corners_that_rounding_has_moved_are_one(tmp_path, jitter):
+def test_corners_that_rounding_has_moved_are_one(jitter):
     vertices, faces = ball(3)
     soup = vertices[faces].reshape(-1, 3)
     soup = soup + np.random.default_rng(0).uniform(-jitter, jitter, soup.shape)

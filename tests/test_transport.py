@@ -602,7 +602,7 @@ def test_the_filter_without_passes_is_the_identity_to_the_bit():
 
 @pytest.mark.slow
 @pytest.mark.long
-def test_paths_over_two_surfaces_bring_what_traced_light_brings(ball, bowl, monkeypatch):
+def test_paths_over_two_surfaces_bring_what_traced_light_brings(bowl, monkeypatch):
     """Reflectance is made equal in all directions, as traced light assumes it to be."""
 
     def matt(materials, normals, wi, wo):

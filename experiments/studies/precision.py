@@ -382,7 +382,7 @@ def shading_stages(params: Params, pipeline: Pipeline, got: dict[str, Any]) -> l
     def hash_grid(x: Any, unit: Any) -> dict[str, Any]:
         return {"features": encode(x["tables"], unit, spec=spec.grid)}
 
-    def mlps(x: Any, table: Any) -> dict[str, Any]:
+    def mlps(x: Any, constants: Any) -> dict[str, Any]:
         materials, shift, _ = heads(x["heads"], x["features"], spec, exact)
         return {"materials": materials, "shift": shift}
 

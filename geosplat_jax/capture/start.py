@@ -21,7 +21,7 @@ from geosplat_jax.splats.radiance import RadianceSplats
 FEWEST_VIEWS = 5
 """Fewest views that splats can be trained on."""
 
-_EXTENT = 4.0
+EXTENT = 4.0
 """Extent of the cameras in the standard world: that of the Blender scenes for which published
 settings were found."""
 _EXTENT_MARGIN = 1.1  # as in the code of Kerbl et al.
@@ -73,7 +73,7 @@ def standard_world(views: Views) -> Similarity:
     centers = views.camera_to_world[:, :3, 3]
     middle = centers.mean(0)
     extent = _EXTENT_MARGIN * np.linalg.norm(centers - middle, axis=1).max()
-    scale = _EXTENT / extent
+    scale = EXTENT / extent
     return Similarity(np.eye(3), -scale * middle, float(scale))
 
 

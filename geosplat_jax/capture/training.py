@@ -26,7 +26,12 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from geosplat_jax.capture.settings import RadianceSettings
-from geosplat_jax.capture.start import first_splats, require_trainable, standard_world
+from geosplat_jax.capture.start import (
+    EXTENT,
+    first_splats,
+    require_trainable,
+    standard_world,
+)
 from geosplat_jax.core import capacity as capacity_module
 from geosplat_jax.core.capacity import Capacities, Usage, bucket, retry
 from geosplat_jax.core.color import linear_to_srgb
@@ -266,8 +271,8 @@ def weights_at(settings: RadianceSettings, step: int) -> StepWeights:
     """Return the numbers of a step: the rate of positions decays, the degree rises."""
     rates = settings.rates
     progress = step / max(settings.steps - 1, 1)
-    # Rates are in units of the extent, which is four in the standard world.
-    means_rate = 4.0 * rates.means * (rates.means_last / rates.means) ** progress
+    # Rates are in units of the extent.
+    means_rate = EXTENT * rates.means * (rates.means_last / rates.means) ** progress
     groups = {
         name: getattr(rates, name) for name in ("scales", "quats", "opacities", "base", "rest")
     }

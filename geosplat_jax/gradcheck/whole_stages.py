@@ -108,11 +108,16 @@ def _from_groups(groups: dict[str, Any]) -> Params:
     )
 
 
-def _loss_problem(name: str, config: Config, rng: np.random.Generator) -> Problem:
-    """Differentiate the whole loss and each of its terms in every group of parameters."""
+def _grid() -> Grid:
+    """Return six cells along the sides of the box [-0.6, 0.6]^3."""
     corner = np.full(3, 0.6)
     grid = fit_grid((-corner, corner), 6)
-    grid = Grid(jnp.asarray(grid.origin), jnp.asarray(grid.cell_size), grid.shape)
+    return Grid(jnp.asarray(grid.origin), jnp.asarray(grid.cell_size), grid.shape)
+
+
+def _loss_problem(name: str, config: Config, rng: np.random.Generator) -> Problem:
+    """Differentiate the whole loss and each of its terms in every group of parameters."""
+    grid = _grid()
     pipeline = build_pipeline(config, config.stages[0], FlexiCubes(grid))
     pipeline = replace(pipeline, capacities=_CAPACITIES)
 
@@ -175,9 +180,7 @@ def refinement_problems(rng: np.random.Generator) -> list[Problem]:
             "stages.refine.weights.indirect=0",
         )
     )
-    corner = np.full(3, 0.6)
-    grid = fit_grid((-corner, corner), 6)
-    grid = Grid(jnp.asarray(grid.origin), jnp.asarray(grid.cell_size), grid.shape)
+    grid = _grid()
     first_pipeline, last_pipeline = (
         replace(build_pipeline(config, stage, FlexiCubes(grid)), capacities=_CAPACITIES)
         for stage in config.active_stages

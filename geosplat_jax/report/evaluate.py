@@ -33,7 +33,7 @@ from geosplat_jax.report.renderer import (
     render_on_white,
 )
 from geosplat_jax.report.scales import error_map
-from geosplat_jax.report.sheets import Shown
+from geosplat_jax.report.sheets import SheetContent
 from geosplat_jax.report.trust import sightings
 
 _MATERIALS = ("roughness", "metallic")
@@ -346,7 +346,7 @@ def _show(
     folder: Path,
     protocol: str,
     radiance: np.ndarray,
-) -> tuple[Shown, dict[str, Any]]:
+) -> tuple[SheetContent, dict[str, Any]]:
     """Write the sheets and pictures; return what they show, and their paths for the metrics."""
     mesh, is_two_sided, seen = renderer.mesh(), renderer.is_two_sided, None
     if truth.train_views is not None:
@@ -354,7 +354,7 @@ def _show(
     lights = {"light": radiance}
     if truth.train_light is not None:
         lights = {"true light": np.asarray(truth.train_light.radiance)} | lights
-    sheets = Shown(
+    sheets = SheetContent(
         views=truth.views,
         psnr=[line["nvs.psnr"] for line in results.views],
         rendered=results.rendered.shown,
@@ -376,7 +376,7 @@ def _show(
 def _write_model(
     trained: Trained,
     sampler: MaterialSampler,
-    sheets: Shown,
+    sheets: SheetContent,
     lights: Mapping[str, EnvLight],
     folder: Path,
     texture_size: int,

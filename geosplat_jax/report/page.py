@@ -90,7 +90,7 @@ def _below(folder: Path, name: Any) -> Path | None:
 
 
 @dataclass(frozen=True)
-class Evaluated:
+class RunResults:
     """A run, or the state at the end of one of its stages, whose results a report shows.
 
     Attributes
@@ -103,7 +103,7 @@ class Evaluated:
     results: Path
 
     @classmethod
-    def of(cls, folder: RunFolder, *, stage: str | None = None) -> "Evaluated":
+    def of(cls, folder: RunFolder, *, stage: str | None = None) -> "RunResults":
         """Return the run as it is now, or at the end of a stage."""
         return cls(folder, folder.path if stage is None else folder.end_of(stage))
 
@@ -134,7 +134,7 @@ class Evaluated:
         return content
 
 
-def _views(gallery: Mapping[str, Any], run: Evaluated, allowance: _Allowance) -> list[dict]:
+def _views(gallery: Mapping[str, Any], run: RunResults, allowance: _Allowance) -> list[dict]:
     """Embed the pictures of each view: pairs to compare, and others."""
     views = []
     for entry in gallery.get("views", []):
@@ -164,7 +164,7 @@ def _views(gallery: Mapping[str, Any], run: Evaluated, allowance: _Allowance) ->
     return [view for view in views if view["pairs"] or view["others"]]
 
 
-def _model(gallery: Mapping[str, Any], run: Evaluated, allowance: _Allowance) -> dict | None:
+def _model(gallery: Mapping[str, Any], run: RunResults, allowance: _Allowance) -> dict | None:
     """Embed the mesh and the lights that it is shown under; None without a mesh that fits."""
     model = gallery.get("model") or {}
     path = _below(run.results, model.get("mesh"))
@@ -189,7 +189,7 @@ def _model(gallery: Mapping[str, Any], run: Evaluated, allowance: _Allowance) ->
     }
 
 
-def _described(run: Evaluated, name: str, room: int) -> dict[str, Any]:
+def _described(run: RunResults, name: str, room: int) -> dict[str, Any]:
     """Collect what the template shows of a run, in ``room`` bytes."""
     record, config = run.folder.record(), run.folder.config()
     lines, metrics = run.folder.metric_lines(), run.metrics()
@@ -250,7 +250,7 @@ def _figure_groups(
     return groups
 
 
-def _names(runs: Sequence[Evaluated]) -> list[str]:
+def _names(runs: Sequence[RunResults]) -> list[str]:
     """Name each run by its folder, with as many parent folders as make the names distinct."""
     parts = [run.folder.path.resolve().parts for run in runs]
     for count in range(1, max(map(len, parts)) + 1):
@@ -278,7 +278,7 @@ def _web(name: str) -> Markup:
     return Markup((_WEB / name).read_text(encoding="utf-8"))
 
 
-def report_html(runs: Sequence[Evaluated]) -> str:
+def report_html(runs: Sequence[RunResults]) -> str:
     """Return the page as HTML.
 
     Raises
@@ -322,7 +322,7 @@ def report_html(runs: Sequence[Evaluated]) -> str:
     )
 
 
-def write_report(path: Path, runs: Sequence[Evaluated]) -> Path:
+def write_report(path: Path, runs: Sequence[RunResults]) -> Path:
     """Write the page atomically and return its path; see `report_html`.
 
     Raises

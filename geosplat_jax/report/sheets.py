@@ -32,7 +32,7 @@ def _grey(values: np.ndarray) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class Shown:
+class SheetContent:
     """Content of the sheets.
 
     Attributes

@@ -85,7 +85,7 @@ class Painter:
 
     def __init__(self, trained: Trained, lights: Mapping[str, EnvLight]) -> None:
         self.trained = trained
-        self._found = Renderer.of(trained).with_aovs("depth")
+        self._as_trained = Renderer.of(trained).with_aovs("depth")
         exposure = math.exp(float(trained.params.log_exposure))
         trained_light = EnvLight(trained.params.light.radiance * exposure)
         self._lights = {AS_TRAINED: same_size(trained_light), **lights}
@@ -99,20 +99,20 @@ class Painter:
     def _renderer(self, look: Look, samples: int) -> Renderer:
         """Return a renderer with the light of a look; the last one of each kind is cached."""
         key = look.light, look.turn, look.intensity
-        is_found = key == (AS_TRAINED, 0.0, 1.0)
-        cache_entry = self._prepared.get((samples, is_found))
+        is_as_trained = key == (AS_TRAINED, 0.0, 1.0)
+        cache_entry = self._prepared.get((samples, is_as_trained))
         if cache_entry is not None and cache_entry[0] == key:
             return cache_entry[1]
-        if is_found:
-            renderer = self._found.with_samples(samples)
+        if is_as_trained:
+            renderer = self._as_trained.with_samples(samples)
         elif cache_entry is not None:  # its buffers have grown to what this surface needs
             renderer = cache_entry[1].under(self._light_of(look))
         else:
             light = self._light_of(look)
             if self._relit is None:
-                self._relit = self._found.relit(light)
+                self._relit = self._as_trained.relit(light)
             renderer = self._relit.with_samples(samples).under(light)
-        self._prepared[samples, is_found] = key, renderer
+        self._prepared[samples, is_as_trained] = key, renderer
         return renderer
 
     def paint(self, look: Look, level: Level) -> Picture:
@@ -163,10 +163,10 @@ class Painter:
 
     def mesh_glb(self) -> bytes | None:
         """Return the mesh with colours on its vertices as GLB, y up; None for an empty surface."""
-        vertices, faces, normals = self._found.mesh()
+        vertices, faces, normals = self._as_trained.mesh()
         if not len(faces) or not nondegenerate(vertices, faces).any():
             return None
-        sampler = MaterialSampler(self.trained, self._found.asset())
+        sampler = MaterialSampler(self.trained, self._as_trained.asset())
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "mesh.glb"
             export_mesh_glb(
@@ -182,7 +182,7 @@ class Painter:
 
     def gaussians(self) -> Gaussians:
         """Return the splats in the colour of their albedo."""
-        asset = self._found.asset()
+        asset = self._as_trained.asset()
         count = int(asset.splats.count)
         rotations = np.asarray(quaternion_to_matrix(jnp.asarray(asset.splats.quats[:count])))
         axes = rotations * np.asarray(asset.splats.scales[:count])[:, None, :]
@@ -213,24 +213,24 @@ class Viewer:
         levels: Sequence[Level] = LEVELS,
         clock: Callable[[], float] = time.perf_counter,
     ) -> None:
-        self._watch, self._given = watch, dict(lights)
+        self._watch, self._new_lights = watch, dict(lights)
         self._levels, self._clock = levels, clock
         self._ladders: dict[int, Ladder] = {}
         trained = watch.newer()
         assert trained is not None, "the first look at a run reads it"
-        self.painter = Painter(trained, self._given)
+        self.painter = Painter(trained, self._new_lights)
 
     @property
     def lights(self) -> tuple[str, ...]:
         """Names of the lights, the recovered one first."""
-        return (AS_TRAINED, *self._given)
+        return (AS_TRAINED, *self._new_lights)
 
     def refresh(self) -> bool:
         """Read a newer checkpoint if there is one; return whether there was."""
         trained = self._watch.newer()
         if trained is None:
             return False
-        self.painter = Painter(trained, self._given)
+        self.painter = Painter(trained, self._new_lights)
         for ladder in self._ladders.values():
             ladder.forget()
         return True
