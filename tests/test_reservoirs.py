@@ -200,7 +200,7 @@ def test_assumed_visibility_is_biased_as_it_says():
 def test_a_fault_shows(monkeypatch, fault):
     jax.clear_caches()
     if fault == "shares by confidence alone":
-        equal = lambda parts, j: jnp.full_like(parts[j], 1 / len(parts))  # noqa: E731
+        equal = lambda terms: jnp.full_like(terms[0], 1 / len(terms))  # noqa: E731
         monkeypatch.setattr(reservoirs, "_balance", equal)
         spec = REUSE["steps and neighbours"]
     else:

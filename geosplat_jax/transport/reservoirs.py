@@ -214,6 +214,15 @@ def _is_open(
     return cast(source.points, directions, index) == OPEN
 
 
+def _balance(terms: Float[Array, "K K R n"]) -> Float[Array, "K R n"]:
+    """Shares m_j(w_j) of K samples by the balance heuristic.
+
+    ``terms`` : c_k p_k(w_j) in row k and column j, what source k could have made of sample j.
+    """
+    source = jnp.arange(terms.shape[0])
+    return safe_divide(terms[source, source], jnp.sum(terms, axis=0))
+
+
 def _joined(
     sources: list[_Source],
     uniforms: Float[Array, "R n"],
@@ -239,10 +248,7 @@ def _joined(
 
     targets = jnp.stack([targets_at(k) for k in range(len(sources))])
     confidences = jnp.stack([source.confidences for source in sources])
-    # The balance heuristic: row k, column j is what source k could have made of sample j.
-    terms = confidences[:, None, None] * targets
-    own_terms = terms[jnp.arange(len(sources)), jnp.arange(len(sources))]
-    shares = safe_divide(own_terms, jnp.sum(terms, axis=0))
+    shares = _balance(confidences[:, None, None] * targets)
     weights = shares * targets[0] * jnp.stack([source.weights for source in sources])
     choice, total = _chosen(uniforms, weights)
     directions = _take(all_directions, choice)
