@@ -342,7 +342,7 @@ def train(arguments: argparse.Namespace) -> None:
         raise UsageError("--force would remove the run that --from reads; take another --output")
     run_folder = RunFolder(folder)
     if not arguments.resume and arguments.hosts is None:
-        # Before the scene is read, which may take long.
+        # Before the scene is read, which may take long. Of several hosts, `fit` asks the first one.
         run_folder.require_free(replace=arguments.force)
     request = _request_of(arguments, run_folder)
     config, reading = request.config, dict(request.reading)

@@ -89,7 +89,7 @@ def safe_log(x: Float[Array, "..."], *, smallest: float = LENGTH_EPSILON) -> Flo
 def safe_logit(p: Float[Array, "..."]) -> Float[Array, "..."]:
     """Inverse of the logistic function, ``log(p / (1 - p))``, for p in [0, 1).
 
-    At least that of `LENGTH_EPSILON`, below which the gradient is zero. Infinite at 1.
+    Finite at 0, where it is the logit of `LENGTH_EPSILON`; infinite at 1.
     """
     return safe_log(p) - jnp.log1p(-p)
 

@@ -75,6 +75,9 @@ that distance rounding may draw its points .04 pixels off, for a focal length of
 
 _BOX_MARGIN = 1.0
 """Pixels by which a mask may exceed the outline of a given box."""
+_REACH_PIXELS = 256
+"""Pixels along a side of the masks that are compared with a given box; of larger ones every n-th
+row and column is."""
 _LARGEST_OUTSIDE = 0.02
 """Share of the masks' pixels that may lie outside of a given box without a warning."""
 
@@ -507,14 +510,16 @@ def _check_reach(views: Views, bounds: Bounds, warnings: list[str]) -> None:
     """Warn of an object that reaches beyond the box that was given for it."""
     corners = np.stack(np.meshgrid(*np.transpose(bounds), indexing="ij"), axis=-1).reshape(-1, 3)
     total, outside = 0, 0
+    stride = max(1, round(np.sqrt(views.height * views.width) / _REACH_PIXELS))
     for number in range(len(views) if views.has_masks else 0):
         pose = views.world_to_camera[number]
         local = (corners @ pose[:3, :3].T + pose[:3, 3]) @ views.intrinsics[number].T
         if (local[:, 2] <= 0).any():
             continue
-        outline = ConvexHull(local[:, :2] / local[:, 2:])
-        row, column = np.nonzero(views.mask(number))
-        points = np.stack([column, row], axis=-1) + 0.5
+        # Joggled, because the outline of a very flat box may have no area.
+        outline = ConvexHull(local[:, :2] / local[:, 2:], qhull_options="QJ")
+        row, column = np.nonzero(views.mask(number)[::stride, ::stride])
+        points = stride * np.stack([column, row], axis=-1) + 0.5
         distance = points @ outline.equations[:, :2].T + outline.equations[:, 2]
         total += len(points)
         outside += int((distance.max(axis=1, initial=-np.inf) > _BOX_MARGIN).sum())

@@ -365,7 +365,7 @@ class Renderer:
         return output
 
     def __call__(self, camera: Camera) -> RenderedView:
-        """Render the single view of ``camera``, with the evaluation's AOVs and `with_aovs`'s."""
+        """Render the single view of ``camera``, with all AOVs of this renderer."""
         illuminations = self._illuminated()
         first_output = self._render(camera, illuminations[0], 0)
         pass_count, total = self._passes_needed(first_output), first_output.rgb[0]
