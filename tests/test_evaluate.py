@@ -181,6 +181,7 @@ def test_truth_of_the_own_making_is_met(perfect):
         assert mean[f"{name}.mse"] < 1e-8
         assert mean[f"{name}.mse_full"] < 1e-8
     np.testing.assert_allclose([mean[f"albedo.scale_{c}"] for c in "rgb"], SCALE, rtol=1e-4)
+    assert mean["albedo.scale_ratio"] == pytest.approx(max(SCALE) / min(SCALE), rel=1e-4)
     for name in LIGHT_NAMES:
         # The fitted scale differs from SCALE in the last bits.
         assert mean[f"relight.{name}.psnr"] > 60
@@ -279,7 +280,14 @@ def test_a_part_of_the_truth_gives_its_part_of_the_metrics(run, views, tmp_path)
     mean = evaluate(run, partial_views, tmp_path)["mean"]
     assert set(mean) == NEW_VIEWS | {"roughness.mse", "roughness.mse_full"}
     # Without a true albedo nothing is scaled.
-    assert "albedo.scale_r" not in mean
+    assert "albedo.scale_ratio" not in mean
+
+
+def test_a_channel_without_true_albedo_has_no_ratio_of_factors(run, views, tmp_path):
+    albedo = views.truth["albedo"] * np.float32([1.0, 1.0, 0.0])
+    mean = evaluate(run, replace(views, truth={"albedo": albedo}, relight={}), tmp_path)["mean"]
+    assert mean["albedo.scale_b"] == 0.0
+    assert "albedo.scale_ratio" not in mean
 
 
 def test_wrong_materials_are_seen(run, views, perfect, tmp_path):

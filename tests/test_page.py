@@ -296,6 +296,13 @@ def test_the_command_writes_the_page_beside_the_run(tmp_path, capsys):
         ("relight.mean.ssim", "New lights, mean", "SSIM", "", "higher"),
         ("relight.a.b.psnr", "New light: a.b", "PSNR", "dB", "higher"),
         ("albedo.scale_r", "Albedo", "factor to the truth, red", "", ""),
+        (
+            "albedo.scale_ratio",
+            "Albedo",
+            "wrong colour: largest factor over the smallest",
+            "",
+            "lower",
+        ),
         ("light.direction_error_deg", "Light", "angle between mean directions", "degrees", "lower"),
         ("light.yaw_correlation", "Light", "correlation after the best turn", "", "higher"),
         ("nvs.surprise", "New views", "surprise", "", ""),

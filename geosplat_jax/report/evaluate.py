@@ -159,6 +159,8 @@ def _material_metrics(
         metrics |= {
             f"albedo.scale_{channel}": float(x) for channel, x in zip("rgb", scale, strict=True)
         }
+        if scale.min() > 0.0:  # A channel whose truth is black has factor 0.
+            metrics["albedo.scale_ratio"] = float(scale.max() / scale.min())
     true_maps = {name: views.truth[name][..., 0] * mask for name in _MATERIALS if name in maps}
     if true_maps:
         predicted_maps = {name: maps[name][..., 0] for name in true_maps}

@@ -29,6 +29,7 @@ _MEASURES = {
     "iou": ("intersection over union", "", "higher"),
     "mae": ("mean angle", "degrees", "lower"),
     "scale": ("factor to the truth", "", ""),
+    "scale_ratio": ("wrong colour: largest factor over the smallest", "", "lower"),
     "correlation": ("correlation of log luminance", "", "higher"),
     "direction_error": ("angle between mean directions", "degrees", "lower"),
     "yaw_error": ("turn about the vertical axis", "degrees", ""),
