@@ -1,4 +1,4 @@
-"""The gradient check: every stage passes it, and planted faults do not."""
+"""The gradient check: every part passes it, and planted faults do not."""
 
 import json
 from dataclasses import replace
@@ -11,10 +11,10 @@ import pytest
 from geosplat_jax import cli
 from geosplat_jax.gradcheck import report
 from geosplat_jax.gradcheck.differences import STEPS, Problem, compare, double_precision
-from geosplat_jax.gradcheck.geometry_stages import adapter_problems
-from geosplat_jax.gradcheck.report import STAGES, check_stage, passes, summary, table
+from geosplat_jax.gradcheck.geometry_parts import adapter_problems
+from geosplat_jax.gradcheck.report import PARTS, check_part, passes, summary, table
 
-SLOW_STAGES = {
+SLOW_PARTS = {
     "denoiser",
     "mesh",
     "adapter",
@@ -30,22 +30,22 @@ SLOW_STAGES = {
 }
 
 
-LONG_STAGES = {"loss", "refinement"}
-"""Stages whose check takes minutes; `make test-long` runs them."""
+LONG_PARTS = {"loss", "refinement"}
+"""Parts whose check takes minutes; `make test-long` runs them."""
 
 
-def marks(stage):
-    """Return the marks of a stage: how long its check takes."""
-    slow = [pytest.mark.slow, pytest.mark.computes] if stage in SLOW_STAGES else []
-    return [*slow, pytest.mark.long] if stage in LONG_STAGES else slow
+def marks(part):
+    """Return the marks of a part: how long its check takes."""
+    slow = [pytest.mark.slow, pytest.mark.computes] if part in SLOW_PARTS else []
+    return [*slow, pytest.mark.long] if part in LONG_PARTS else slow
 
 
 @pytest.mark.parametrize(
-    "stage",
-    [pytest.param(s, marks=marks(s)) for s in STAGES],
+    "part",
+    [pytest.param(p, marks=marks(p)) for p in PARTS],
 )
-def test_every_gradient_agrees_with_differences(stage):
-    rows = check_stage(stage)
+def test_every_gradient_agrees_with_differences(part):
+    rows = check_part(part)
     failing_rows = [row for row in rows if not passes(row)]
     assert rows
     assert not failing_rows, table(failing_rows)
@@ -238,9 +238,9 @@ def test_the_summary_hides_no_number_that_is_none():
     assert summary({"shown": [good, bad]}).splitlines()[1].count("nan") == 3
 
 
-def test_an_unknown_stage_is_refused():
-    with pytest.raises(ValueError, match="unknown stage 'teapot'; expected some of isosurface"):
-        check_stage("teapot")
+def test_an_unknown_part_is_refused():
+    with pytest.raises(ValueError, match="unknown part 'teapot'; expected some of isosurface"):
+        check_part("teapot")
 
 
 def test_the_command_prints_the_table_and_writes_the_records(capsys, tmp_path):
@@ -250,20 +250,20 @@ def test_the_command_prints_the_table_and_writes_the_records(capsys, tmp_path):
     assert "specular <- roughness" in output
     assert "float32" in output
     records = json.loads(path.read_text())
-    assert {record["stage"] for record in records} == {"light"}
+    assert {record["part"] for record in records} == {"light"}
     assert all(record["relative"] < 1e-6 for record in records)
 
 
 def test_the_command_fails_when_a_gradient_does(capsys, monkeypatch):
     factors = np.ones(6)
     factors[2] = 1.5
-    monkeypatch.setitem(report.STAGES, "light", lambda rng: [_square_problem(factors)])
+    monkeypatch.setitem(report.PARTS, "light", lambda rng: [_square_problem(factors)])
     assert cli.main(["gradcheck", "light"]) == 1
     captured = capsys.readouterr()
     assert "FAILS" in captured.out
     assert "d y[2] / d x[2]" in captured.err
 
 
-def test_the_command_names_the_stages_when_one_is_unknown(capsys):
+def test_the_command_names_the_parts_when_one_is_unknown(capsys):
     assert cli.main(["gradcheck", "teapot"]) == 2
     assert "rasterizer" in capsys.readouterr().err

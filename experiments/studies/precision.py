@@ -40,7 +40,7 @@ from geosplat_jax.fit.stages import (
 )
 from geosplat_jax.fit.step import StepReport, initial_state, train_step
 from geosplat_jax.gradcheck.differences import double_precision
-from geosplat_jax.gradcheck.whole_stages import _from_groups, _groups
+from geosplat_jax.gradcheck.whole_parts import _from_groups, _groups
 from geosplat_jax.hashgrid import HashGridSpec, Layer, encode
 from geosplat_jax.io.dataset import Dataset, load_dataset
 from geosplat_jax.io.images import encode_srgb

@@ -10,7 +10,7 @@ from geosplat_jax.capture.settings import RadianceSettings
 from geosplat_jax.fit.budget import parse_duration, parse_memory
 from geosplat_jax.fit.presets import PRESET_PRIORS, PRESETS, QUALITIES
 from geosplat_jax.fit.runtime import installed_versions
-from geosplat_jax.gradcheck.report import STAGES
+from geosplat_jax.gradcheck.report import PARTS
 from geosplat_jax.io.poses import PoseSettings
 from geosplat_jax.materials import MATERIAL_PRIORS
 from geosplat_jax.report.consistency import DEFAULT_VIEWS
@@ -298,7 +298,7 @@ def _add_export(export: argparse.ArgumentParser) -> None:
 def _add_gradcheck(gradcheck: argparse.ArgumentParser) -> None:
     """Describe the gradcheck command."""
     gradcheck.add_argument(
-        "stages", nargs="*", metavar="PART", help=f"some of {', '.join(STAGES)} (default: all)"
+        "parts", nargs="*", metavar="PART", help=f"some of {', '.join(PARTS)} (default: all)"
     )
     gradcheck.add_argument("--sweep", action="store_true", help="show the error at every step size")
     gradcheck.add_argument(

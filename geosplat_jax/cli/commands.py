@@ -24,10 +24,10 @@ from geosplat_jax.fit.folder import RunError
 from geosplat_jax.fit.gauge import change_lines
 from geosplat_jax.fit.presets import make_config
 from geosplat_jax.gradcheck.report import (
+    PARTS,
     SINGLE_TOLERANCE,
-    STAGES,
     TOLERANCE,
-    check_stage,
+    check_part,
     passes,
     summary,
     table,
@@ -371,14 +371,14 @@ def _export(arguments: argparse.Namespace) -> None:
 
 def _gradcheck(arguments: argparse.Namespace) -> None:
     """Compare gradients with float64 differences and print the tables."""
-    names = list(dict.fromkeys(arguments.stages)) or list(STAGES)
-    unknown_names = [name for name in names if name not in STAGES]
+    names = list(dict.fromkeys(arguments.parts)) or list(PARTS)
+    unknown_names = [name for name in names if name not in PARTS]
     if unknown_names:
-        raise UsageError(f"unknown part {unknown_names[0]!r}; expected some of {', '.join(STAGES)}")
+        raise UsageError(f"unknown part {unknown_names[0]!r}; expected some of {', '.join(PARTS)}")
     require_place(arguments.json, "--json")
     results = {}
     for name in names:
-        results[name] = check_stage(name, seed=arguments.seed)
+        results[name] = check_part(name, seed=arguments.seed)
         print(f"{table(results[name], sweep=arguments.sweep)}\n", flush=True)
     print(summary(results))
     if arguments.json is not None:

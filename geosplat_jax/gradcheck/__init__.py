@@ -1,1 +1,1 @@
-"""Proof of the gradients: finite differences of every stage against reverse mode."""
+"""Proof of the gradients: finite differences of every part against reverse mode."""

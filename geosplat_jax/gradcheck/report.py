@@ -1,4 +1,4 @@
-"""The stages by name, and the table of what was compared."""
+"""The parts by name, and the table of what was compared."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import asdict
@@ -7,15 +7,15 @@ from typing import Any
 import numpy as np
 
 from geosplat_jax.gradcheck.differences import STEPS, Comparison, Problem, compare, double_precision
-from geosplat_jax.gradcheck.geometry_stages import adapter_problems, isosurface_problems
-from geosplat_jax.gradcheck.image_stages import (
+from geosplat_jax.gradcheck.geometry_parts import adapter_problems, isosurface_problems
+from geosplat_jax.gradcheck.image_parts import (
     denoiser_problems,
     loss_term_problems,
     projection_problems,
     rasteriser_problems,
 )
-from geosplat_jax.gradcheck.mesh_stages import mesh_problems
-from geosplat_jax.gradcheck.shading_stages import (
+from geosplat_jax.gradcheck.mesh_parts import mesh_problems
+from geosplat_jax.gradcheck.shading_parts import (
     bsdf_problems,
     face_problems,
     hash_grid_problems,
@@ -26,7 +26,7 @@ from geosplat_jax.gradcheck.shading_stages import (
     split_sum_problems,
     transport_problems,
 )
-from geosplat_jax.gradcheck.whole_stages import (
+from geosplat_jax.gradcheck.whole_parts import (
     loss_problems,
     refinement_problems,
     smoothness_problems,
@@ -38,7 +38,7 @@ TOLERANCE = 1e-6
 SINGLE_TOLERANCE = 1e-3
 """Largest relative error of a float32 gradient against the float64 one that passes."""
 
-STAGES: dict[str, Callable[[np.random.Generator], list[Problem]]] = {
+PARTS: dict[str, Callable[[np.random.Generator], list[Problem]]] = {
     "isosurface": isosurface_problems,
     "mesh": mesh_problems,
     "adapter": adapter_problems,
@@ -67,12 +67,12 @@ _HEADER = (
 )
 
 
-def check_stage(name: str, *, seed: int = 0, single: bool = True) -> list[Comparison]:
-    """Compare every problem of a stage.
+def check_part(name: str, *, seed: int = 0, single: bool = True) -> list[Comparison]:
+    """Compare every problem of a part.
 
     Parameters
     ----------
-    name : a key of `STAGES`.
+    name : a key of `PARTS`.
     seed : seed of the problems' numbers, samples and directions.
     single : also compare float32 with float64.
 
@@ -85,10 +85,10 @@ def check_stage(name: str, *, seed: int = 0, single: bool = True) -> list[Compar
     ValueError
         On an unknown name.
     """
-    if name not in STAGES:
-        raise ValueError(f"unknown stage {name!r}; expected some of {', '.join(STAGES)}")
+    if name not in PARTS:
+        raise ValueError(f"unknown part {name!r}; expected some of {', '.join(PARTS)}")
     with double_precision():
-        problems = STAGES[name](np.random.default_rng(seed))
+        problems = PARTS[name](np.random.default_rng(seed))
         return [row for p in problems for row in compare(p, single=single, seed=seed)]
 
 
@@ -155,14 +155,14 @@ def _sweep_line(row: Comparison) -> str:
 
 
 def summary(checked: dict[str, list[Comparison]]) -> str:
-    """Lay out one line per stage, with its largest errors."""
-    lines = [f"{'stage':<12} {'pairs':>6} {'rel. L2':>8} {'1 - cos':>8} {'directions':>10} float32"]
-    for stage, rows in checked.items():
+    """Lay out one line per part, with its largest errors."""
+    lines = [f"{'part':<12} {'pairs':>6} {'rel. L2':>8} {'1 - cos':>8} {'directions':>10} float32"]
+    for part, rows in checked.items():
         # np.max is NaN where any value is NaN; Python's max may not be.
         directions = np.max([(row.along_gradient, row.random_direction) for row in rows])
         verdict = "" if all(map(passes, rows)) else "  FAILS"
         lines.append(
-            f"{stage:<12} {len(rows):>6} {np.max([r.relative for r in rows]):8.1e} "
+            f"{part:<12} {len(rows):>6} {np.max([r.relative for r in rows]):8.1e} "
             f"{np.max([r.one_minus_cosine for r in rows]):8.1e} {directions:10.1e} "
             f"{np.max([r.single or 0.0 for r in rows]):7.1e}{verdict}"
         )
@@ -171,4 +171,4 @@ def summary(checked: dict[str, list[Comparison]]) -> str:
 
 def to_records(checked: dict[str, list[Comparison]]) -> list[dict[str, Any]]:
     """Plain dictionaries of all comparisons, ready for JSON."""
-    return [{"stage": stage, **asdict(row)} for stage, rows in checked.items() for row in rows]
+    return [{"part": part, **asdict(row)} for part, rows in checked.items() for row in rows]
