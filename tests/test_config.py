@@ -99,11 +99,14 @@ def test_presets_carry_the_numbers_of_the_paper_and_of_the_authors_code():
         assert not config.material.bias
         assert config.objective.relative_albedo == 0
         assert config.stage("refine").splats.darkest_metal == 0
+        assert all("light_cast" not in stage.weights for stage in config.stages)
     for quality in QUALITIES:
         config = make_config("default", quality)
         assert config.material.bias
         assert config.objective.relative_albedo == 0.5
         assert config.stage("refine").splats.darkest_metal == 0.2
+        casts = [stage.weights_at(0).get("light_cast") for stage in config.stages]
+        assert casts == [pytest.approx(0.003), pytest.approx(0.003), None]
 
 
 @pytest.mark.parametrize("preset", ["paper", "code"])

@@ -65,6 +65,9 @@ def _default() -> Config:
     photometric = {"l1": 0.8, "ssim": 0.2, "mask": 5.0}
     surface = {"deviation": 0.5, "weights": 0.1}
     smooth = {"smoothness_albedo": 0.03, "smoothness_roughness_metallic": 0.03}
+    # Photographs of a matt object do not tell its colour from that of the light, which is what this
+    # small weight decides (docs/quality.md, "The colour of the light").
+    grey_light = {"light_cast": 0.003}
     split_sum = Stage(
         name=SPLIT_SUM,
         steps=500,
@@ -77,7 +80,9 @@ def _default() -> Config:
             light=1e-2,
             exposure=5e-3,
         ),
-        weights=_weights(**photometric, entropy=Schedule(0.2, 0.01, 0.5), **surface, **smooth),
+        weights=_weights(
+            **photometric, entropy=Schedule(0.2, 0.01, 0.5), **surface, **smooth, **grey_light
+        ),
     )
     # Materials learn faster than the light. What they have absorbed, shadows included, the light no
     # longer has to explain; so their rates warm up. Few samples make noisy gradients, so the rate
@@ -101,7 +106,9 @@ def _default() -> Config:
             light=1e-2,
             exposure=5e-3,
         ),
-        weights=_weights(**photometric, entropy=0.01, **surface, **smooth, indirect=0.001),
+        weights=_weights(
+            **photometric, entropy=0.01, **surface, **smooth, **grey_light, indirect=0.001
+        ),
     )
     refine = Stage(
         name=REFINE,
