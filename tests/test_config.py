@@ -457,6 +457,21 @@ def test_differences_name_the_setting_and_both_values():
     assert differences(config, changed_config, stages=["split_sum"]) == []
 
 
+def test_a_term_that_is_left_out_equals_one_without_weight():
+    """A run of an older version, which has no such term, is resumed with a weight of 0."""
+    config = make_config()
+    stage = config.stages[0]
+    other_weights = {name: w for name, w in stage.weights.items() if name != "light_cast"}
+    older_config = replace(
+        config, stages=(replace(stage, weights=other_weights), *config.stages[1:])
+    )
+    same_config = make_config(overrides=("stages.split_sum.weights.light_cast=0",))
+    assert differences(older_config, same_config) == []
+    assert differences(older_config, config) == [
+        "stages.split_sum.weights.light_cast.value: 0.0 -> 0.003"
+    ]
+
+
 @pytest.mark.parametrize(
     ("overrides", "told"),
     [

@@ -542,16 +542,23 @@ def changed_settings(
 ) -> dict[str, tuple[Any, Any]]:
     """Map every setting in which two configurations differ to both values.
 
-    Start meshes with the same content are the same, wherever their files are.
+    Start meshes with the same content are the same, wherever their files are. A term of the loss
+    that a stage leaves out has the weight 0.
 
     ``stages`` : names of the stages to compare, by default all. What all stages share is always
     compared.
     """
+    terms: dict[str, set[str]] = {}
+    for stage in (*first.stages, *second.stages):
+        terms.setdefault(stage.name, set()).update(stage.weights)
+    no_weight = to_plain(Schedule())
 
     def flat(config: Config) -> dict[str, Any]:
         values = json.loads(json.dumps(config.to_dict()))
         if stages is not None:
             values["stages"] = {n: s for n, s in values["stages"].items() if n in stages}
+        for name, stage in values["stages"].items():
+            stage["weights"] = dict.fromkeys(terms[name], no_weight) | stage["weights"]
         return _flat(values)
 
     left, right = flat(first), flat(second)
