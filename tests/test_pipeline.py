@@ -229,8 +229,9 @@ def test_an_empty_surface_shows_the_background_and_has_zero_gradient():
     empty_params = replace(
         params, geometry=replace(params.geometry, sdf=jnp.abs(params.geometry.sdf) + 1)
     )
-    # Regularisers of the surface's weights have a gradient with and without a surface.
-    weights = {**pipeline.weights, "weights": jnp.float32(0.0)}
+    # Penalties on the surface's weights and on the light have a gradient without a surface, too.
+    no_weight = jnp.float32(0.0)
+    weights = {**pipeline.weights, "weights": no_weight, "light_cast": no_weight}
     (total, report), gradient = evaluate(replace(pipeline, weights=weights), empty_params, batch)
     assert np.isfinite(total)
     assert int(report.splat_count) == 0
