@@ -1,18 +1,21 @@
 """Weigh the quality of a sweep's knobs against their time: decibels per second, Pareto front.
 
-``python experiments/trade.py DIR [--seeds DIR ...] --output FILE.md``, where ``experiments/run.py``
-wrote ``DIR``. Seconds are those of all stages, also of stages that a run took over from another
-one, without compilation: the time that the run would have taken alone. All runs share a cache of
-compiled programs, so that the first run compiles for the others; whole seconds, as measured, have
-their own column. Error bars are standard errors over the scenes, of means over the seeds.
+``python experiments/trade.py DIR [--seeds DIR ...] --output FILE.md [--plot FILE.png]``, where
+``experiments/run.py`` wrote ``DIR``. Seconds are those of all stages, also of stages that a run
+took over from another one, without compilation: the time that the run would have taken alone. All
+runs share a cache of compiled programs, so that the first run compiles for the others; whole
+seconds, as measured, have their own column. Error bars are standard errors over the scenes, of
+means over the seeds. The plot shows every figure over the time, both in comparison with the base;
+it needs matplotlib (the extra ``plots``).
 """
 
 import argparse
+import importlib.util
 import json
 import math
 import statistics
 import sys
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -137,10 +140,12 @@ def pareto(points: dict[str, tuple[float, float]]) -> list[str]:
     return front
 
 
-def _pairs(
-    repeated: list[dict[str, dict[str, Point]]], name: str, base: str
-) -> list[list[tuple[Point, Point]]]:
-    """Return, for every scene, the pairs of a run and the base with the same seed."""
+_Pairs = list[list[tuple[Point, Point]]]
+"""Points of a run and of the base with the same seed, for every scene."""
+
+
+def _pairs(repeated: list[dict[str, dict[str, Point]]], name: str, base: str) -> _Pairs:
+    """Pair the points of a run with those of the base."""
     scenes = dict.fromkeys(scene for points in repeated for scene in points[base])
     return [
         [
@@ -222,9 +227,20 @@ _COSTS = {
 """Columns of the costs of a run, as ratios to those of the base."""
 
 
-def _knob_row(
-    pairs: list[list[tuple[Point, Point]]], names: list[str], figures: list[str], count: int
-) -> list[str]:
+def _ratios(pairs: _Pairs, cost: Callable[[Point], float]) -> list[list[float]]:
+    """Ratios of a cost to that of the base, where the base has it."""
+    return _finite([cost(a) / cost(b) for a, b in group if cost(b)] for group in pairs)
+
+
+def _changes(pairs: _Pairs, figure: str) -> list[list[float]]:
+    """Differences of a figure from the base; NaN where one is missing."""
+    return [
+        [a.figures.get(figure, math.nan) - b.figures.get(figure, math.nan) for a, b in group]
+        for group in pairs
+    ]
+
+
+def _knob_row(pairs: _Pairs, names: list[str], figures: list[str], count: int) -> list[str]:
     """Return the row of a run: its costs and figures in comparison with the base.
 
     Parameters
@@ -236,14 +252,10 @@ def _knob_row(
     """
     row = []
     for cost in _COSTS.values():
-        ratios = _finite([cost(a) / cost(b) for a, b in group if cost(b)] for group in pairs)
+        ratios = _ratios(pairs, cost)
         row.append(f"×{_mean(ratios):.2f}" if ratios else _NONE)
     for name in names:
-        change = [
-            [a.figures.get(name, math.nan) - b.figures.get(name, math.nan) for a, b in group]
-            for group in pairs
-        ]
-        row.append(_spread(change, name, count))
+        row.append(_spread(_changes(pairs, name), name, count))
     gains = [[quality(a, figures) - quality(b, figures) for a, b in group] for group in pairs]
     row.append(_spread(gains, "psnr", count))
     # Seconds are those of the pairs whose quality is known.
@@ -318,6 +330,72 @@ def front_table(sweep: dict[str, Any], repeated: list[dict[str, dict[str, Point]
     return lines
 
 
+@dataclass(frozen=True)
+class Change:
+    """Time and one figure of a run in comparison with the base.
+
+    Attributes
+    ----------
+    ratio : seconds without compilation over those of the base.
+    mean : mean difference of the figure.
+    error : its standard error; None where it is not known.
+    """
+
+    ratio: float
+    mean: float
+    error: float | None
+
+
+def changes_over_time(
+    sweep: dict[str, Any], repeated: list[dict[str, dict[str, Point]]], figure: str
+) -> dict[str, Change]:
+    """Compare a figure and the time of every run with those of the base.
+
+    Runs that lack the figure in one of the trainings are left out.
+    """
+    base = sweep["runs"][0]["name"]
+    count = sum(len(points[base]) for points in repeated)
+    compared = {}
+    for run in sweep["runs"]:
+        pairs = _pairs(repeated, run["name"], base)
+        ratios, groups = _ratios(pairs, _COSTS["seconds, ratio"]), _finite(_changes(pairs, figure))
+        if count and sum(map(len, groups)) == sum(map(len, ratios)) == count:
+            compared[run["name"]] = Change(_mean(ratios), _mean(groups), _standard_error(groups))
+    return compared
+
+
+def draw(sweep: dict[str, Any], repeated: list[dict[str, dict[str, Point]]], path: Path) -> None:
+    """Draw every figure over the time, as differences from the base, and the front as a line."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    names = sweep["figures"]
+    columns = min(len(names), 2)
+    rows = math.ceil(len(names) / columns)
+    size = (6.5 * columns, 4.5 * rows)
+    plot, axes = plt.subplots(rows, columns, figsize=size, squeeze=False, layout="constrained")
+    for axis, figure in zip(axes.flat, names, strict=False):
+        sign = -1.0 if arrow(figure) == " ↓" else 1.0
+        changes = changes_over_time(sweep, repeated, figure)
+        for name, change in changes.items():
+            axis.errorbar(change.ratio, change.mean, change.error, fmt="o", capsize=3, markersize=4)
+            offset = {"xytext": (5, 4), "textcoords": "offset points"}
+            axis.annotate(name, (change.ratio, change.mean), fontsize=8, **offset)
+        front = pareto({name: (c.ratio, sign * c.mean) for name, c in changes.items()})
+        positions = [(changes[name].ratio, changes[name].mean) for name in front]
+        axis.plot(*zip(*positions, strict=True), "-", color="0.7", zorder=0)
+        axis.axhline(0.0, color="0.85", linewidth=0.8, zorder=0)
+        axis.set(title=f"{figure}{arrow(figure)}", xlabel="seconds, ratio", ylabel="difference")
+        axis.margins(x=0.15)
+    for axis in axes.flat[len(names) :]:
+        axis.remove()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    plot.savefig(path, dpi=95)
+    plt.close(plot)
+
+
 def compose(sweep: dict[str, Any], repeated: list[dict[str, dict[str, Point]]]) -> str:
     """Compose the tables as markdown."""
     base, figures = sweep["runs"][0]["name"], quality_figures(sweep)
@@ -354,14 +432,17 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("folder", type=Path, help="output of experiments/run.py")
     parser.add_argument("--seeds", nargs="+", type=Path, default=[], metavar="FOLDER")
     parser.add_argument("--output", type=Path, help="markdown file (default: the terminal)")
+    parser.add_argument("--plot", type=Path, help="also draw all figures over the time")
     arguments = parser.parse_args(argv)
+    if arguments.plot is not None and importlib.util.find_spec("matplotlib") is None:
+        print("error: --plot needs matplotlib: install the extra `plots`", file=sys.stderr)
+        return 2
     try:
         sweep = report.read_record(arguments.folder)
         report.read_repetitions(sweep, arguments.seeds)
         folders = [arguments.folder, *arguments.seeds]
-        text = compose(
-            sweep, [read_points(folder, report.read_record(folder)) for folder in folders]
-        )
+        repeated = [read_points(folder, report.read_record(folder)) for folder in folders]
+        text = compose(sweep, repeated)
     except ReportError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
@@ -370,6 +451,8 @@ def main(argv: list[str] | None = None) -> int:
     else:
         arguments.output.parent.mkdir(parents=True, exist_ok=True)
         arguments.output.write_text(text, encoding="utf-8")
+    if arguments.plot is not None:
+        draw(sweep, repeated, arguments.plot)
     return 0
 
 

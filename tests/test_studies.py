@@ -52,6 +52,18 @@ def test_every_study_says_how_it_is_called(name, monkeypatch, capsys):
     assert f"usage: {name}.py" in capsys.readouterr().out
 
 
+def test_a_study_of_an_hour_needs_what_draws_its_plot_before_it_begins(
+    tmp_path, monkeypatch, capsys
+):
+    monkeypatch.setattr(resolution.importlib.util, "find_spec", lambda name: None)
+    options = ["--output", str(tmp_path), "--plot", str(tmp_path / "plot.png")]
+    monkeypatch.setattr(sys, "argv", ["resolution.py", str(tmp_path / "scene"), *options])
+    with pytest.raises(SystemExit) as program_exit:
+        resolution.main()
+    assert program_exit.value.code == 2
+    assert "--plot needs matplotlib: install the extra `plots`" in capsys.readouterr().err
+
+
 def _with_random_biases(params):
     """Return parameters whose heads have other biases than the zeros that they start with."""
     rng = np.random.default_rng(0)

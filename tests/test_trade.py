@@ -311,6 +311,33 @@ def test_a_missing_figure_leaves_a_scene_out_and_is_said():
     assert "nan" not in text
 
 
+def test_a_plot_compares_every_run_that_has_all_figures_with_the_base(tmp_path):
+    points = {
+        "base": {"a": _point(20.0), "b": _point(30.0, seconds=20.0)},
+        "more": {"a": _point(21.0, seconds=20.0), "b": _point(33.0, seconds=80.0)},
+        "partly": {"a": _point(21.0)},
+        "broken": {"a": _point(21.0), "b": _point(None)},
+    }
+    sweep = _record(["a", "b"])
+    sweep["runs"] += [{"name": name, "title": "", "x": None} for name in ("partly", "broken")]
+    changes = trade.changes_over_time(sweep, [points], "nvs.psnr")
+    # Ratios of 2 and 4, gains of 1 and 3 decibels.
+    assert changes == {"base": trade.Change(1.0, 0.0, 0.0), "more": trade.Change(3.0, 2.0, 1.0)}
+    one_scene = {name: {"a": scenes["a"]} for name, scenes in points.items()}
+    changes = trade.changes_over_time(_record(["a"]), [one_scene], "nvs.psnr")
+    assert changes["more"] == trade.Change(2.0, 1.0, None)
+    pytest.importorskip("matplotlib")
+    trade.draw(sweep, [points], tmp_path / "images" / "trade.png")
+    assert (tmp_path / "images" / "trade.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_plot_without_matplotlib_is_refused_in_one_line(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(trade.importlib.util, "find_spec", lambda name: None)
+    arguments = [str(tmp_path), "--plot", str(tmp_path / "trade.png")]
+    assert trade.main(arguments) == 2
+    assert capsys.readouterr().err == "error: --plot needs matplotlib: install the extra `plots`\n"
+
+
 def _left(scene, name, config, lines):
     """Write the files of a training that the tables read."""
     folder = scene / name

@@ -20,6 +20,7 @@ first. Existing runs are reused, and refused if they have other settings.
 """
 
 import argparse
+import importlib.util
 import json
 import subprocess
 import sys
@@ -200,6 +201,8 @@ def main() -> None:
     parser.add_argument("--plot", type=Path, help="also draw the curves")
     parser.add_argument("--picture", type=Path, help="also show one view of every run")
     arguments = parser.parse_args()
+    if arguments.plot is not None and importlib.util.find_spec("matplotlib") is None:
+        parser.error("--plot needs matplotlib: install the extra `plots`")
     enable_compilation_cache()
     retain_freed_memory()
     results = {scene.name: study(scene, arguments) for scene in arguments.scenes}
