@@ -1,14 +1,14 @@
 """Find the Pareto front of all knobs together by successive halving: many short, few long runs.
 
-``python experiments/halving.py SWEEP.toml --scenes ROOT --output DIR [--joint 24] [--rungs 3]``
-takes as candidates the runs of a sweep, and random combinations of them: of every group (a knob)
-the base or one of its values. In the first rung all candidates are trained with a fraction of their
-steps, and with schedules shortened accordingly. The best third is trained again with three times as
-many steps, and so on; the last rung trains in full. Candidates of a rung share the stages that they
-have in common. The best candidates are those of the front of quality and seconds, then those of
-the front of the rest, and so on, until the places are taken. The same command continues where it
-was stopped, and ``--cluster`` is as in `run`; each ``DIR/rung_K`` is a sweep of its own, and
-``DIR/front.md`` is written at the end.
+``python experiments/halving.py SWEEP.toml --scenes ROOT --output DIR [--scene NAME ...]
+[--joint 24] [--rungs 3]`` takes as candidates the runs of a sweep, and random combinations of them:
+of every group (a knob) the base or one of its values. In the first rung all candidates are trained
+with a fraction of their steps, and with schedules shortened accordingly. The best third is trained
+again with three times as many steps, and so on; the last rung trains in full. Candidates of a rung
+share the stages that they have in common. The best candidates are those of the front of quality and
+seconds, then those of the front of the rest, and so on, until the places are taken. The same
+command continues where it was stopped, and ``--cluster`` is as in `run`; each ``DIR/rung_K`` is a
+sweep of its own, and ``DIR/front.md`` is written at the end.
 """
 
 import argparse
@@ -193,6 +193,7 @@ def main(
     parser.add_argument("sweep", type=Path, help="whose runs and groups are the candidates")
     parser.add_argument("--scenes", type=Path, required=True, help="folder of the scene folders")
     parser.add_argument("--output", type=Path, required=True, help="folder of all rungs")
+    parser.add_argument("--scene", nargs="+", default=[], metavar="NAME", help="only these scenes")
     parser.add_argument("--joint", type=int, default=24, metavar="N", help="combinations")
     parser.add_argument("--rungs", type=int, default=3)
     parser.add_argument("--keep", type=float, default=1 / 3, help="share that goes on")
@@ -208,6 +209,7 @@ def main(
         sweep = read_sweep(
             arguments.sweep, overrides=arguments.overrides, quality=arguments.quality
         )
+        sweep = replace(sweep, scenes=tuple(runner.chosen_scenes(arguments, sweep)))
         do_jobs = runner.jobs_runner(arguments, start=start)
         last_sweep, folder, failures = search(sweep, arguments, do_jobs)
         record = trade.report.read_record(folder)

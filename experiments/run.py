@@ -385,13 +385,22 @@ def _state(
     return "waits" if source in unfinished_jobs else "lost"
 
 
-def _chosen(requested_names: list[str], names: Iterable[str], option: str) -> list[str]:
+def chosen(requested_names: list[str], names: Iterable[str], option: str) -> list[str]:
     """Return the names that an option asks for, or all names; `SweepError` for unknown ones."""
     names = list(names)
     for name in requested_names:
         if name not in names:
             raise SweepError(f"{option} {name}: the sweep has only {', '.join(names)}")
     return [name for name in names if name in requested_names] if requested_names else names
+
+
+def chosen_scenes(arguments: argparse.Namespace, sweep: Sweep) -> list[str]:
+    """Return the scenes that ``--scene`` asks for, or all; `SweepError` if one has no folder."""
+    names = chosen(arguments.scene, sweep.scenes, "--scene")
+    for name in names:
+        if not (arguments.scenes / name).is_dir():
+            raise SweepError(f"--scenes {arguments.scenes} has no folder {name!r}")
+    return names
 
 
 def _command_line(arguments: argparse.Namespace) -> str:
@@ -479,11 +488,8 @@ def main(argv: list[str] | None = None, *, start: Callable[[Job], None] = in_a_p
             downscale=arguments.downscale,
         )
         do_jobs = jobs_runner(arguments, start=start)
-        scenes = _chosen(arguments.scene, sweep.scenes, "--scene")
-        names = _chosen(arguments.only, (run.name for run in sweep.runs), "--only")
-        for scene in scenes:
-            if not (arguments.scenes / scene).is_dir():
-                raise SweepError(f"--scenes {arguments.scenes} has no folder {scene!r}")
+        scenes = chosen_scenes(arguments, sweep)
+        names = chosen(arguments.only, (run.name for run in sweep.runs), "--only")
         jobs = plan(sweep, arguments.scenes, arguments.output, scenes=scenes, names=names)
         check_folders(jobs)
         write_record(sweep, arguments.scenes, arguments.output, _command_line(arguments))

@@ -493,6 +493,30 @@ def test_halving_trains_many_a_little_and_few_in_full(tmp_path):
     assert len(fakes.trained) == trained_count
 
 
+def test_the_bundled_search_combines_settings_that_differ():
+    sweep = read_sweep(SWEEPS / "joint.toml")
+    assert set(homes(sweep).values()) == {run.name for run in sweep.runs}
+    combinations = halving.joint_runs(sweep, 8, seed=2)
+    assert len({run.title for run in combinations}) == 8
+    assert all("-" in run.title and run.overrides for run in combinations)
+    # The first rung has a third of every number of steps.
+    short_run = halving.shortened(sweep, sweep.runs[0], 1 / 3)
+    stages = sweep.config(short_run).active_stages
+    full_stages = sweep.config(sweep.runs[0]).active_stages
+    assert [stage.steps for stage in stages] == [round(stage.steps / 3) for stage in full_stages]
+
+
+def test_halving_searches_only_the_scenes_that_it_is_given(tmp_path, capsys):
+    path, fakes = _write(tmp_path, SWEEP), Trained()
+    command = [str(path), "--scenes", str(tmp_path / "scenes"), "--output", str(tmp_path / "out")]
+    command += ["--joint", "0", "--rungs", "1", "--scene"]
+    assert halving.main([*command, "two"], start=fakes.start) == 0
+    assert {Path(call[0]).parent.name for call in fakes.evaluated} == {"two"}
+    assert "on two, 1 seed" in (tmp_path / "out" / "front.md").read_text()
+    assert halving.main([*command, "three"], start=fakes.start) == 2
+    assert "--scene three: the sweep has only one, two" in capsys.readouterr().err
+
+
 def test_what_fails_in_the_last_rung_is_in_the_status(tmp_path, capsys):
     path, fakes = _write(tmp_path, SWEEP), Trained()
     fakes.broken = {"one/half"}
