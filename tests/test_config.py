@@ -480,6 +480,8 @@ def test_a_term_that_is_left_out_equals_one_without_weight():
             ["stages.monte_carlo.rates.albedo.warmup = 150", "rates.roughness_metallic.warmup"],
         ),
         (("stages.split_sum.weights.indirect=1.0",), ["learns no indirect light"]),
+        (("adapter.shift=0.2",), ["adapter.shift has no effect"]),
+        (("adapter.shift=0.2", "material.has_shift=false"), []),
         (
             (
                 "stages.monte_carlo.transport.indirect=traced",

@@ -580,6 +580,10 @@ def differences(first: Config, second: Config, *, stages: list[str] | None = Non
 def config_warnings(config: Config) -> list[str]:
     """Return warnings about settings without effect, or with one that is hardly intended."""
     warnings = []
+    if config.adapter.shift != 0 and config.material.has_shift:
+        warnings.append(
+            "adapter.shift has no effect: the inward shift is learned; set material.has_shift=false"
+        )
     for stage in config.active_stages:
         for name, rate in stage.rates.items():
             if rate.warmup > stage.position(stage.steps):
