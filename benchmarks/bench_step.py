@@ -1,7 +1,6 @@
 """Time whole training steps of every stage, and a whole draft run, on the bundled scene."""
 
 import json
-import resource
 import statistics
 import tempfile
 import time
@@ -10,7 +9,7 @@ from pathlib import Path
 from geosplat_jax.core.allocator import retain_freed_memory
 from geosplat_jax.fit.folder import RunFolder
 from geosplat_jax.fit.presets import make_config
-from geosplat_jax.fit.runtime import enable_compilation_cache
+from geosplat_jax.fit.runtime import enable_compilation_cache, peak_memory_mb
 from geosplat_jax.fit.train import fit
 from geosplat_jax.io.dataset import load_dataset
 
@@ -56,7 +55,7 @@ def run_whole() -> dict[str, float]:
     return {
         "whole_draft_ms": round(1e3 * seconds, 1),
         "whole_draft_psnr": round(last_line["psnr"], 2),
-        "peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024,
+        "peak_memory_mb": peak_memory_mb(),
     }
 
 

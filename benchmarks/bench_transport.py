@@ -10,7 +10,6 @@ ratio to that of the first run, and the peak memory of the process, with compila
 import argparse
 import json
 import os
-import resource
 import statistics
 import subprocess
 import sys
@@ -21,7 +20,7 @@ from pathlib import Path
 from geosplat_jax.core.allocator import retain_freed_memory
 from geosplat_jax.fit.folder import RunFolder
 from geosplat_jax.fit.presets import MONTE_CARLO, QUALITIES, make_config
-from geosplat_jax.fit.runtime import enable_compilation_cache
+from geosplat_jax.fit.runtime import enable_compilation_cache, peak_memory_mb
 from geosplat_jax.fit.train import fit
 from geosplat_jax.io.dataset import load_dataset
 
@@ -47,7 +46,7 @@ def step_of(overrides: list[str], *, scene: Path, quality: str, steps: int) -> d
     times = [line["seconds"] for line in lines if line["stage"] == MONTE_CARLO]
     return {
         "step_ms": 1e3 * statistics.median(times[_WARM_UP:]),
-        "peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+        "peak_memory_mb": peak_memory_mb(),
     }
 
 

@@ -1,5 +1,9 @@
 """Needs that exceed the memory are refused beforehand, with the setting that causes them."""
 
+import subprocess
+import sys
+from pathlib import Path
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -156,6 +160,17 @@ def test_an_accelerator_has_memory_of_its_own(machine, monkeypatch):
     accelerators[0].stats = None  # some devices report no memory
     require_program_memory("program", compiled)
     assert peak_memory_mb() == 0
+
+
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="a property of Linux")
+def test_the_memory_of_the_program_that_started_a_training_is_no_part_of_its_own():
+    large = np.ones(2**30, np.uint8)
+    script = "from geosplat_jax.fit.runtime import peak_memory_mb; print(peak_memory_mb())"
+    process = subprocess.run([sys.executable, "-c", script], capture_output=True, check=True)
+    assert large.nbytes // 2**20 == 1024
+    assert 30 < int(process.stdout) < 900
+    block = np.ones(2**28, np.uint8)
+    assert peak_memory_mb() >= block.nbytes // 2**20
 
 
 def test_a_limit_of_the_process_counts(monkeypatch):

@@ -31,8 +31,9 @@ RADIUS = 0.7
 """Radius of the ball, world units; with cameras at distance 3 it covers a fifth of each image."""
 
 _OPEN = """
-import json, resource, sys, time
+import json, sys, time
 import numpy as np
+from geosplat_jax.fit.runtime import peak_memory_mb
 from geosplat_jax.io.dataset import load_dataset
 from geosplat_jax.io.windows import around_object
 scene, downscale, batches = sys.argv[1], int(sys.argv[2]), int(sys.argv[3])
@@ -50,7 +51,7 @@ for _ in range(batches):
     times.append(time.perf_counter() - began)
 if times:
     found["batch_seconds"] = float(np.median(times))
-found["peak_gb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e9
+found["peak_gb"] = peak_memory_mb() * 2**20 / 1e9
 print(json.dumps({name: round(value, 3) for name, value in found.items()}))
 """
 

@@ -9,6 +9,7 @@ import hashlib
 import importlib.metadata
 import os
 import platform
+import re
 import sys
 import threading
 from collections.abc import Callable
@@ -91,9 +92,17 @@ def peak_memory_mb() -> int:
         stats = [device.memory_stats() or {} for device in jax.local_devices()]
         return max(entry.get("peak_bytes_in_use", 0) for entry in stats) // (1024 * 1024)
     try:
+        status = Path("/proc/self/status").read_text()
+    except OSError:  # not on Linux
+        status = ""
+    high_water_mark = re.search(r"^VmHWM:\s*(\d+) kB$", status, re.MULTILINE)
+    if high_water_mark:
+        return int(high_water_mark[1]) // 1024
+    try:
         import resource
     except ImportError:  # not on Windows
         return 0
+    # Not the first choice: on Linux a new program inherits the maximum of the one that started it.
     largest = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return largest // (1024 * 1024 if sys.platform == "darwin" else 1024)
 
