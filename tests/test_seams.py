@@ -329,6 +329,15 @@ def test_resuming_in_any_stage_equals_the_run_in_one_go(dataset, run, tmp_path, 
     ]
 
 
+def test_stages_can_be_taken_from_a_run_that_knows_no_later_ones(dataset, run, tmp_path):
+    """The stages that runs of a sweep share are such a run."""
+    config = mesh_config()
+    shared_folder = tmp_path / "shared"
+    fit(dataset, replace(config, stages=config.stages[:2]), shared_folder)
+    begin = TakeOver(shared_folder, "lamp")
+    assert_same(run[1], fit(dataset, config, tmp_path / "run", begin=begin))
+
+
 def test_the_stages_before_another_one_can_be_taken_from_a_run(dataset, run, tmp_path):
     state = fit(dataset, mesh_config(), tmp_path / "run", begin=TakeOver(run[0], "lamp"))
     assert_same(run[1], state)

@@ -674,7 +674,7 @@ def adopted_loop(
         )
     loop = new_loop(dataset, config, folder, devices)
     _put(loop, tree, description)
-    if source_config.stage(name) != config.stage(name):
+    if config.stage(name) not in source_config.stages:
         # The checkpoint's plan of the next stage is for the settings of the other run.
         loop.to_come = None
     return loop
