@@ -128,12 +128,13 @@ def full_costs(folder: Path, sweep: Sweep, factor: float) -> dict[str, tuple[flo
     """Return, by run, the seconds of a full training and the quality reached so far.
 
     Both are means over the scenes; runs that are not complete on all scenes are left out. Seconds
-    follow from median steps, without compilation, which does not grow with the number of steps.
+    follow from median steps, without compilation, which does not grow with the number of steps,
+    and are those of one speed of the machine if the runs recorded it (`trade.usual_speed`).
     """
     record = trade.report.read_record(folder)
     figures = trade.quality_figures(record)
     values = {}
-    for name, scenes in trade.read_points(folder, record).items():
+    for name, scenes in trade.read_points(folder, record, trade.usual_speed([folder])).items():
         if len(scenes) == len(sweep.scenes):
             cost = statistics.fmean(point.steady for point in scenes.values()) / factor
             mean_quality = statistics.fmean(
@@ -213,7 +214,8 @@ def main(
         do_jobs = runner.jobs_runner(arguments, start=start)
         last_sweep, folder, failures = search(sweep, arguments, do_jobs)
         record = trade.report.read_record(folder)
-        text = trade.compose(record, [trade.read_points(folder, record)])
+        usual_ms = trade.usual_speed([folder])
+        text = trade.compose(record, [trade.read_points(folder, record, usual_ms)], usual_ms)
     except (SweepError, ReportError, OSError) as error:
         runner.say(f"error: {error}")
         return 2

@@ -26,6 +26,7 @@ from typing import Any
 import cluster
 from jobs import Job, homes, is_finished, is_trained, plan
 from report import command_line
+from speed import SpeedLog
 from sweep import Sweep, SweepError, read_sweep
 
 from geosplat_jax.core.allocator import retain_freed_memory
@@ -147,8 +148,9 @@ def execute(
     # If the evaluation failed, the old record would still declare its figures complete.
     (folder / "evaluation.json").unlink(missing_ok=True)
     if not is_trained(job):
-        config = config_from_dict(job.config)
-        train(Path(job.scene), folder, config, begin=_begin(job), **job.options)
+        config, begin = config_from_dict(job.config), _begin(job)
+        listener = SpeedLog(folder, continues=begin.resumes)
+        train(Path(job.scene), folder, config, begin=begin, listener=listener, **job.options)
     if job.evaluate is not None:
         reading = {} if job.evaluate_options is None else {"reading": job.evaluate_options}
         evaluate(folder, **job.evaluate, **reading)

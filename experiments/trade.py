@@ -4,9 +4,10 @@
 ``experiments/run.py`` wrote ``DIR``. Seconds are those of all stages, also of stages that a run
 took over from another one, without compilation: the time that the run would have taken alone. All
 runs share a cache of compiled programs, so that the first run compiles for the others; whole
-seconds, as measured, have their own column. Error bars are standard errors over the scenes, of
-means over the seeds. The plot shows every figure over the time, both in comparison with the base;
-it needs matplotlib (the extra ``plots``).
+seconds, as measured, have their own column. Where `speed` recorded how fast the machine was,
+seconds without compilation are those of its median speed. Error bars are standard errors over the
+scenes, of means over the seeds. The plot shows every figure over the time, both in comparison with
+the base; it needs matplotlib (the extra ``plots``).
 """
 
 import argparse
@@ -21,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 import report
+import speed
 from report import ReportError, arrow, digits
 
 from geosplat_jax.fit.config import Config, config_from_dict
@@ -38,7 +40,7 @@ class Point:
     ----------
     seconds : seconds of the whole training, with compilation.
     steady : seconds of its steps without compilation: in every stage, their number times the
-        median.
+        median. They are those of a machine of `usual_speed` if that is known.
     memory_mb : peak memory of the training processes, MB.
     figures : metrics of the evaluation.
     """
@@ -66,11 +68,30 @@ def _identity(config: Config, count: int, downscale: int) -> str:
     return json.dumps([plain, downscale], sort_keys=True)
 
 
-def stage_times(scene: Path) -> dict[str, tuple[float, float, float]]:
+def usual_speed(folders: Iterable[Path]) -> float | None:
+    """Return the median of what all runs of sweeps measured as `speed`, ms.
+
+    None if a stage that has steps has no measurement, so that its time cannot be related to them.
+    """
+    values = []
+    for path in (path.parent for folder in folders for path in folder.glob("*/*/run.json")):
+        measured = speed.milliseconds_of_stages(path)
+        if {line["stage"] for line in RunFolder(path).metric_lines()} - set(measured):
+            return None
+        values += [milliseconds for of_stage in measured.values() for milliseconds in of_stage]
+    return statistics.median(values) if values else None
+
+
+def stage_times(scene: Path, usual_ms: float | None) -> dict[str, tuple[float, float, float]]:
     """Read the costs of every stage of every run of a scene, by `_identity` of the stages up to it.
 
     Values are seconds, seconds without compilation, and peak memory in MB. Stages whose steps are
     not complete are left out.
+
+    Parameters
+    ----------
+    scene : folder of the runs.
+    usual_ms : see `usual_speed`; None for seconds without compilation as they were measured.
     """
     costs = {}
     for path in sorted(scene.glob("*/run.json")):
@@ -87,17 +108,22 @@ def stage_times(scene: Path) -> dict[str, tuple[float, float, float]]:
                 seconds = [line["seconds"] for line in stage_lines]
                 name = _identity(config, number, downscale)
                 steady = stage.steps * statistics.median(seconds)
+                if usual_ms is not None:
+                    stage_ms = speed.milliseconds_of_stages(path.parent)[stage.name]
+                    steady *= usual_ms / statistics.median(stage_ms)
                 memory = max(line.get("peak_memory_mb", 0) for line in stage_lines)
                 costs[name] = (sum(seconds), steady, memory)
     return costs
 
 
-def read_points(folder: Path, sweep: dict[str, Any]) -> dict[str, dict[str, Point]]:
-    """Read all runs that have figures and times, by name and scene."""
+def read_points(
+    folder: Path, sweep: dict[str, Any], usual_ms: float | None
+) -> dict[str, dict[str, Point]]:
+    """Read all runs that have figures and times, by name and scene; ``usual_ms``: `usual_speed`."""
     entries = report.read_entries(folder, sweep)
     points: dict[str, dict[str, Point]] = {run["name"]: {} for run in sweep["runs"]}
     for scene, runs in entries.items():
-        times = stage_times(folder / scene)
+        times = stage_times(folder / scene, usual_ms)
         for run in sweep["runs"]:
             entry, config = runs[run["name"]], config_from_dict(run["config"])
             count = len(config.active_stages)
@@ -396,19 +422,24 @@ def draw(sweep: dict[str, Any], repeated: list[dict[str, dict[str, Point]]], pat
     plt.close(plot)
 
 
-def compose(sweep: dict[str, Any], repeated: list[dict[str, dict[str, Point]]]) -> str:
-    """Compose the tables as markdown."""
+def compose(
+    sweep: dict[str, Any], repeated: list[dict[str, dict[str, Point]]], usual_ms: float | None
+) -> str:
+    """Compose the tables as markdown; ``usual_ms``: `usual_speed`."""
     base, figures = sweep["runs"][0]["name"], quality_figures(sweep)
     count = len(repeated)
     basis = "the scenes, of means over the seeds"
     if len(sweep["scenes"]) == 1:
         basis = "the seeds, since there is one scene"
+    machine = ", as fast as the machine was when they were made"
+    if usual_ms is not None:
+        machine = f", on a machine that adds 16M exponentials in {usual_ms:.1f} ms"
     introduction = (
         f"Against `{base}` at quality {sweep['quality']}, on {', '.join(sweep['scenes'])}, "
         f"{count} seed{'s' if count > 1 else ''}. Quality is the mean of {', '.join(figures)}. "
         f"± is the standard error over {basis}. Seconds are those of median steps, were nothing "
-        "compiled; whole seconds are with what a run happened to compile. Where figures are "
-        "missing, (1 of 2) says how many trainings have them."
+        f"compiled{machine}; whole seconds are as measured, with what a run happened to compile. "
+        "Where figures are missing, (1 of 2) says how many trainings have them."
     )
     return "\n".join(
         [
@@ -441,8 +472,9 @@ def main(argv: list[str] | None = None) -> int:
         sweep = report.read_record(arguments.folder)
         report.read_repetitions(sweep, arguments.seeds)
         folders = [arguments.folder, *arguments.seeds]
-        repeated = [read_points(folder, report.read_record(folder)) for folder in folders]
-        text = compose(sweep, repeated)
+        usual_ms = usual_speed(folders)
+        repeated = [read_points(folder, report.read_record(folder), usual_ms) for folder in folders]
+        text = compose(sweep, repeated, usual_ms)
     except ReportError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

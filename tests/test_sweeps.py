@@ -20,6 +20,7 @@ sys.path.insert(0, str(ROOT / "experiments"))
 import report  # noqa: E402
 import run as runner  # noqa: E402
 from jobs import Job, beginning, homes, parts_of, shared_stages  # noqa: E402
+from speed import SpeedLog  # noqa: E402
 from sweep import read_sweep  # noqa: E402
 
 from geosplat_jax.fit.config import Config, Stage, config_from_dict, differences  # noqa: E402
@@ -91,7 +92,8 @@ class Fakes:
         self.trained, self.evaluated, self.broken = [], [], set(broken)
         self.first_stages = {}
 
-    def train(self, scene, folder, config, *, begin, **options):
+    def train(self, scene, folder, config, *, begin, listener, **options):
+        assert isinstance(listener, SpeedLog)
         label = f"{scene.name}/{folder.name}"
         source, first_stage = (
             (begin.source, begin.first_stage) if begin.takes_over else (None, None)
@@ -877,6 +879,8 @@ def test_the_smoke_sweep_runs_for_real(tmp_path):
     assert process.returncode == 0, process.stderr
     lines = (runs / "duck" / "more-samples" / "metrics.jsonl").read_text().splitlines()
     assert [json.loads(line)["stage"] for line in lines] == ["monte_carlo"] * 2
+    speed_lines = (runs / "duck" / "more-samples" / "speed.jsonl").read_text().splitlines()
+    assert json.loads(speed_lines[0])["exp_ms"] > 0
     second_process = subprocess.run(command, capture_output=True, text=True)
     assert second_process.returncode == 0
     assert second_process.stderr.count("finished already") == 2

@@ -14,12 +14,14 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "experiments"))
 import cluster  # noqa: E402
 import halving  # noqa: E402
 import run as runner  # noqa: E402
+import speed  # noqa: E402
 import trade  # noqa: E402
 from jobs import homes, parts_of, plan  # noqa: E402
 from sweep import read_sweep  # noqa: E402
 from test_sweeps import SWEEPS, Fakes, _arguments, _write  # noqa: E402
 
 from geosplat_jax.fit.config import Stage, config_from_dict  # noqa: E402
+from geosplat_jax.fit.listener import Progress  # noqa: E402
 from geosplat_jax.fit.presets import make_config  # noqa: E402
 from geosplat_jax.fit.start_mesh import MeshSettings  # noqa: E402
 
@@ -244,7 +246,7 @@ def _more(scenes, *seeds):
         }
         for points in seeds
     ]
-    text = trade.compose(_record(list(scenes)), points_by_seed)
+    text = trade.compose(_record(list(scenes)), points_by_seed, None)
     return _rows(text, "knob")["2 (more)"], text
 
 
@@ -363,7 +365,7 @@ def test_what_a_run_compiles_is_no_part_of_its_cost(tmp_path):
             quality="draft", overrides=(*steps, f"run.preview_every={preview_interval}")
         )
         _left(tmp_path / "one", name, config, [(first_seconds, 500), (1.0, 2000), (1.0, 800)])
-        times = trade.stage_times(tmp_path / "one")
+        times = trade.stage_times(tmp_path / "one", None)
         seconds, steady_seconds, memory = times[trade._identity(config, 1, 1)]
         assert (seconds, steady_seconds, memory) == (first_seconds + 2.0, 3.0, 2000)
         points[name] = trade.Point(seconds, steady_seconds, memory, {"nvs.psnr": 20.0})
@@ -372,17 +374,67 @@ def test_what_a_run_compiles_is_no_part_of_its_cost(tmp_path):
     assert row[1] == f"×{3 / 93:.2f}"
 
 
+def test_times_are_those_of_one_speed_of_the_machine(tmp_path):
+    """The second run took twice as long because the machine was half as fast."""
+    configs = {}
+    for name, cells, slowness in (("base", 32, 1.0), ("more", 48, 2.0)):
+        steps = [f"stages.{s}.steps={n}" for s, n in zip(STAGES, (3, 0, 0), strict=True)]
+        overrides = (*steps, f"geometry.resolution={cells}")
+        configs[name] = make_config(quality="draft", overrides=overrides)
+        _left(tmp_path / "one", name, configs[name], [(slowness, 500)] * 3)
+        for milliseconds in (4.0 * slowness, 4.0 * slowness, 100.0):
+            with (tmp_path / "one" / name / "speed.jsonl").open("a") as file:
+                file.write(json.dumps({"stage": "split_sum", "exp_ms": milliseconds}) + "\n")
+
+    def steady_seconds(usual_ms):
+        times = trade.stage_times(tmp_path / "one", usual_ms)
+        return [times[trade._identity(config, 1, 1)][1] for config in configs.values()]
+
+    usual_ms = trade.usual_speed([tmp_path])
+    assert usual_ms == 8.0
+    assert steady_seconds(usual_ms) == [6.0, 6.0]
+    assert steady_seconds(None) == [3.0, 6.0]
+    (tmp_path / "one/base/speed.jsonl").write_text('{"stage": "refine", "exp_ms": 4.0}\n')
+    assert trade.usual_speed([tmp_path]) is None
+    (tmp_path / "one/base/speed.jsonl").unlink()
+    assert trade.usual_speed([tmp_path]) is None
+
+
+def _progress(step, stage):
+    return Progress(step, 100, stage, 1.0, 20.0, 10, 1.0, None)
+
+
+def test_the_speed_of_the_machine_is_measured_between_steps(tmp_path, monkeypatch):
+    monkeypatch.setattr(speed, "exponential_milliseconds", lambda repeats: 5.0)
+    log = speed.SpeedLog(tmp_path / "run", continues=False)
+    (tmp_path / "run").mkdir()
+    for step in range(1, 46):
+        log.on_step(_progress(step, "split_sum" if step < 30 else "refine"))
+    expected = {"split_sum": [5.0, 5.0], "refine": [5.0, 5.0]}
+    assert speed.milliseconds_of_stages(tmp_path / "run") == expected
+    path = tmp_path / "run" / speed.FILE
+    steps = [json.loads(line)["step"] for line in path.read_text().splitlines()]
+    assert steps == [1, 20, 30, 40]
+    with path.open("a") as file:
+        file.write('{"step": 60, "st')
+    assert speed.milliseconds_of_stages(tmp_path / "run") == expected
+    speed.SpeedLog(tmp_path / "run", continues=True).on_step(_progress(60, "refine"))
+    assert speed.milliseconds_of_stages(tmp_path / "run")["refine"] == [5.0, 5.0, 5.0]
+    speed.SpeedLog(tmp_path / "run", continues=False)
+    assert speed.milliseconds_of_stages(tmp_path / "run") == {}
+
+
 def test_a_run_that_is_being_written_is_read_and_a_damaged_one_left_out(tmp_path, capsys):
     steps = [f"stages.{s}.steps={n}" for s, n in zip(STAGES, (3, 0, 0), strict=True)]
     config = make_config(quality="draft", overrides=tuple(steps))
     for name in ("whole", "torn"):
         _left(tmp_path / "one", name, config, [(1.0, 500), (1.0, 2000), (1.0, 800)])
-    expected = trade.stage_times(tmp_path / "one")
+    expected = trade.stage_times(tmp_path / "one", None)
     with (tmp_path / "one/torn/metrics.jsonl").open("a") as file:
         file.write('{"step": 3, "st')
-    assert trade.stage_times(tmp_path / "one") == expected
+    assert trade.stage_times(tmp_path / "one", None) == expected
     (tmp_path / "one/torn/run.json").write_text("{")
-    assert trade.stage_times(tmp_path / "one") == expected
+    assert trade.stage_times(tmp_path / "one", None) == expected
     assert "left out: " in capsys.readouterr().err
 
 

@@ -16,6 +16,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from geosplat_jax.fit.config import Config, Stage
 
@@ -139,8 +140,13 @@ def exponential_milliseconds(repeats: int = 71) -> float:
 
     There are so many repeats that short interruptions by other programs do not matter.
     """
-    values = jnp.linspace(-1.0, 1.0, 1 << 24)
-    return kernel_milliseconds(jax.jit(lambda x: jnp.sum(jnp.exp(x))), values, repeats)
+    return kernel_milliseconds(_sum_of_exponentials, jnp.linspace(-1.0, 1.0, 1 << 24), repeats)
+
+
+@jax.jit
+def _sum_of_exponentials(values: Float[Array, " n"]) -> Float[Array, ""]:
+    """Return ``sum(exp(x))``."""
+    return jnp.sum(jnp.exp(values))
 
 
 def slowness_of_machine() -> float:
