@@ -130,8 +130,13 @@ def lists_only(inputs, eligible, camera, *, size, capacities, tile_size):
 @partial(jax.jit, static_argnames=("size", "capacities", "tile_size"))
 def forward(inputs, eligible, camera, *, size, capacities, tile_size):
     """Rasterise a view: image, alpha and usage."""
+    means, quats, scales, opacities, features = inputs
     return rasterize(
-        *inputs,
+        means,
+        quats,
+        scales,
+        opacities,
+        features,
         eligible,
         world_to_camera=camera[0],
         intrinsics=camera[1],

@@ -75,7 +75,6 @@ def _with_random_biases(params):
     return jax.tree_util.tree_map_with_path(shaken, params)
 
 
-@pytest.mark.slow
 def test_the_chain_of_the_study_of_precision_is_the_render():
     pipeline, params = ball(tiny_config("material.bias=true"))
     params = _with_random_biases(params)

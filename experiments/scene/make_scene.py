@@ -113,7 +113,8 @@ def test_views(count: int) -> list[View]:
 
 
 def _transform(matrix: NDArray[np.float64]) -> Any:
-    return mi.ScalarTransform4f(np.ascontiguousarray(matrix))
+    rows: Any = np.ascontiguousarray(matrix)
+    return mi.ScalarTransform4f(rows)
 
 
 def environment(image: Array) -> dict[str, Any]:

@@ -74,9 +74,13 @@ def hull_mesh(dataset: Dataset) -> trimesh.Trimesh:
     """Extract the visual hull by marching cubes."""
     grid = fit_grid(dataset.bounds, HULL_CELLS)
     camera = dataset.train.camera()
-    matrices = (np.asarray(x, np.float64) for x in (camera.world_to_camera, camera.intrinsics))
-    masks = dataset.train.alphas
-    distance = hull_sdf(*matrices, masks, grid, valid=dataset.train.valid)
+    distance = hull_sdf(
+        np.asarray(camera.world_to_camera, np.float64),
+        np.asarray(camera.intrinsics, np.float64),
+        dataset.train.alphas,
+        grid,
+        valid=dataset.train.valid,
+    )
     volume = distance.reshape(grid.vertex_shape[::-1]).transpose(2, 1, 0)
     cell = float(grid.cell_size)
     vertices, faces, _, _ = marching_cubes(volume, 0.0, spacing=(cell,) * 3)

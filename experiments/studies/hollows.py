@@ -41,9 +41,9 @@ def is_inside(mesh: trimesh.Trimesh, points: np.ndarray) -> np.ndarray:
 
 def rows(scene: Path, resolution: int) -> list[list[str]]:
     """Carve the hull of a scene and count; one row."""
-    grid, hull, photographs = _hull(scene, resolution)
+    grid, hull, (world_to_camera, intrinsics, images, valid) = _hull(scene, resolution)
     began = time.perf_counter()
-    carved_hull = carve_hollows(*photographs[:3], hull, grid, valid=photographs[3])
+    carved_hull = carve_hollows(world_to_camera, intrinsics, images, hull, grid, valid=valid)
     seconds = time.perf_counter() - began
     is_carved = (hull < 0.0) & (carved_hull >= 0.0)
     truth = scene / "mesh_gt.ply"
@@ -67,8 +67,10 @@ def rows(scene: Path, resolution: int) -> list[list[str]]:
 
 def candidates(scene: Path, resolution: int) -> list[list[str]]:
     """Return a row for every part of the hull that may be a hollow, the largest first."""
-    grid, hull, photographs = _hull(scene, resolution)
-    possible_hollows = hollow_candidates(*photographs[:3], hull, grid, valid=photographs[3])
+    grid, hull, (world_to_camera, intrinsics, images, valid) = _hull(scene, resolution)
+    possible_hollows = hollow_candidates(
+        world_to_camera, intrinsics, images, hull, grid, valid=valid
+    )
     return [
         [
             str(int(part.region.sum())),

@@ -384,7 +384,7 @@ def count_changes(
     for kind_rows in zip(*views, strict=True):
         sums = {n: sum(getattr(p, n) for p in kind_rows) for n in ("population", "changed", "near")}
         rows.append(replace(kind_rows[0], **sums))
-    rows += _count_fields(*seen, common_rows, config)
+    rows += _count_fields(seen[0], seen[1], common_rows, config)
     old_residual, new_residual = (state["residual"].reshape(-1) for state in seen)
     is_nonzero = (old_residual != 0) | (new_residual != 0)
     rows.append(

@@ -306,7 +306,7 @@ def chain(
         lit, gather(shifted_splats.normals), view, light, pipeline.transport.fg_table
     )
     splat_inputs = {"means": means, "quats": gather(shifted_splats.quats)}
-    splat_inputs["scales"] = gather(shifted_splats.scales, padding=1.0)
+    splat_inputs["scales"] = gather(shifted_splats.scales)
     footprints = pipeline.project(**splat_inputs, camera=camera)
     footprints = replace(
         footprints,

@@ -219,7 +219,7 @@ def rendered(
     means = gather(splats.means)
     ranges = safe_norm(means - camera.centers, keepdims=True)
     image, alpha = composite(
-        project(means, gather(splats.quats), gather(splats.scales, padding=1.0), **lens),
+        project(means, gather(splats.quats), gather(splats.scales), **lens),
         gather(splats.opacities),
         jnp.concatenate([gather(splats.normals), ranges], axis=-1),
         lists,
