@@ -13,12 +13,12 @@ from geosplat_jax.fit.listener import Listener, Progress
 FILE = "speed.jsonl"
 """Name of the file in the folder of a run."""
 
-_INTERVAL = 20
+_INTERVAL = 10
 """Steps between two measurements; each takes some 50 ms, which are no part of a step's seconds."""
 
 
 class SpeedLog(Listener):
-    """Writes a line to ``speed.jsonl`` after every twentieth step, and after the first of a stage.
+    """Writes a line to ``speed.jsonl`` after every tenth step, and after the first of a stage.
 
     The lines hold ``step``, ``stage``, and ``exp_ms``, the milliseconds of
     `fit.costs.exponential_milliseconds`.

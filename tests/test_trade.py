@@ -408,13 +408,13 @@ def test_the_speed_of_the_machine_is_measured_between_steps(tmp_path, monkeypatc
     monkeypatch.setattr(speed, "exponential_milliseconds", lambda repeats: 5.0)
     log = speed.SpeedLog(tmp_path / "run", continues=False)
     (tmp_path / "run").mkdir()
-    for step in range(1, 46):
-        log.on_step(_progress(step, "split_sum" if step < 30 else "refine"))
+    for step in range(1, 26):
+        log.on_step(_progress(step, "split_sum" if step < 15 else "refine"))
     expected = {"split_sum": [5.0, 5.0], "refine": [5.0, 5.0]}
     assert speed.milliseconds_of_stages(tmp_path / "run") == expected
     path = tmp_path / "run" / speed.FILE
     steps = [json.loads(line)["step"] for line in path.read_text().splitlines()]
-    assert steps == [1, 20, 30, 40]
+    assert steps == [1, 10, 15, 20]
     with path.open("a") as file:
         file.write('{"step": 60, "st')
     assert speed.milliseconds_of_stages(tmp_path / "run") == expected
