@@ -75,8 +75,12 @@ def usual_speed(folders: Iterable[Path]) -> float | None:
     """
     values = []
     for path in (path.parent for folder in folders for path in folder.glob("*/*/run.json")):
+        try:
+            stages = {line["stage"] for line in RunFolder(path).metric_lines()}
+        except RunError:
+            continue  # `stage_times` leaves the run out and says why
         measured = speed.milliseconds_of_stages(path)
-        if {line["stage"] for line in RunFolder(path).metric_lines()} - set(measured):
+        if stages - set(measured):
             return None
         values += [milliseconds for of_stage in measured.values() for milliseconds in of_stage]
     return statistics.median(values) if values else None

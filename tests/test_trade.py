@@ -394,6 +394,9 @@ def test_times_are_those_of_one_speed_of_the_machine(tmp_path):
     assert usual_ms == 8.0
     assert steady_seconds(usual_ms) == [6.0, 6.0]
     assert steady_seconds(None) == [3.0, 6.0]
+    _left(tmp_path / "one", "damaged", configs["base"], [(1.0, 500)])
+    (tmp_path / "one/damaged/metrics.jsonl").write_text("no line\n{}\n")
+    assert trade.usual_speed([tmp_path]) == 8.0
     (tmp_path / "one/base/speed.jsonl").write_text('{"stage": "refine", "exp_ms": 4.0}\n')
     assert trade.usual_speed([tmp_path]) is None
     (tmp_path / "one/base/speed.jsonl").unlink()
