@@ -32,8 +32,8 @@ class SpeedLog(Listener):
     def __init__(self, folder: Path, *, continues: bool) -> None:
         self._path, self._stage = folder / FILE, ""
         if self._path.exists():
-            text = "\n".join(_whole_lines(self._path)) if continues else ""
-            self._path.write_text(text and text + "\n", encoding="utf-8")
+            lines = _whole_lines(self._path) if continues else []
+            self._path.write_text("".join(f"{line}\n" for line in lines), encoding="utf-8")
 
     def on_step(self, progress: Progress) -> None:
         """Measure the speed, if it is due."""
