@@ -579,15 +579,17 @@ def test_what_a_lens_leaves_out_is_square_and_centred(blender):
     np.testing.assert_array_equal(intrinsics, [[40.0, 0, middle], [0, 40.0, middle], [0, 0, 1.0]])
 
 
-def test_a_vertical_angle_gives_the_vertical_focal_length(blender):
-    with_lens(blender, {"camera_angle_x": 0.8, "camera_angle_y": 0.4, "w": SIZE, "h": SIZE})
+@pytest.mark.parametrize("size", [{"w": SIZE, "h": SIZE}, {}])
+def test_a_vertical_angle_gives_the_vertical_focal_length(blender, size):
+    with_lens(blender, {"camera_angle_x": 0.8, "camera_angle_y": 0.4, **size})
     intrinsics = load(blender).train.intrinsics[0]
     assert intrinsics[0, 0] == pytest.approx(0.5 * SIZE / np.tan(0.4))
     assert intrinsics[1, 1] == pytest.approx(0.5 * SIZE / np.tan(0.2))
 
 
-def test_angles_may_be_given_in_degrees(blender):
-    with_lens(blender, {"x_fov": 40.0, "y_fov": 20.0, "w": SIZE, "h": SIZE})
+@pytest.mark.parametrize("size", [{"w": SIZE, "h": SIZE}, {}])
+def test_angles_may_be_given_in_degrees(blender, size):
+    with_lens(blender, {"x_fov": 40.0, "y_fov": 20.0, **size})
     intrinsics = load(blender).train.intrinsics[0]
     expected_focals = 0.5 * SIZE / np.tan(np.radians([20.0, 10.0]))
     np.testing.assert_allclose(np.diag(intrinsics)[:2], expected_focals)

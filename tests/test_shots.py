@@ -77,13 +77,17 @@ def test_an_angle_keeps_the_shape_of_pixels_and_the_axis_of_the_lens():
 
 def test_a_shorter_turntable_removes_the_frames_of_a_longer_one(tmp_path):
     longer_shots = Cameras("train", turntable=3).shots(DATASET, np.zeros(3))
-    for name in [f"{shot.name}_rgba.png" for shot in longer_shots] + ["turntable_notes.txt"]:
+    frames = [f"{shot.name}{ending}" for shot in longer_shots for ending in (".png", "_rgba.png")]
+    for name in [*frames, "turntable.gif", "turntable_notes.txt"]:
         (tmp_path / name).write_text("a picture")
     remove_later_frames(tmp_path, Cameras("train").shots(DATASET, np.zeros(3)))
-    assert len(list(tmp_path.iterdir())) == 4
+    assert len(list(tmp_path.iterdir())) == 8
     remove_later_frames(tmp_path, Cameras("train", turntable=2).shots(DATASET, np.zeros(3)))
     assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "turntable.gif",
+        "turntable_0000.png",
         "turntable_0000_rgba.png",
+        "turntable_0001.png",
         "turntable_0001_rgba.png",
         "turntable_notes.txt",
     ]

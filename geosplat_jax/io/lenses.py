@@ -26,24 +26,28 @@ _OTHER_PROJECTIONS = ("ftheta_p0", "latlong", "equirectangular", "orthographic")
 
 @dataclass(frozen=True)
 class AngleLens:
-    """A lens with square pixels and its axis in the middle of the image.
+    """A lens with its axis in the middle of the image.
 
     Attributes
     ----------
     angle_x : horizontal field of view of the undistorted pinhole, radians.
+    angle_y : the same for the vertical; None where pixels are square.
     distortion : None for a pinhole.
     size : width and height in pixels that the file gives for images, or None; used for images that
         do not exist yet.
     """
 
     angle_x: float
+    angle_y: float | None = None
     distortion: Distortion | None = None
     size: tuple[int, int] | None = None
 
     def intrinsics(self, width: int, height: int) -> Float[np.ndarray, "3 3"]:
         """Return the intrinsic matrix for an image of this size, in its pixels."""
-        focal = 0.5 * width / np.tan(0.5 * self.angle_x)
-        return _matrix(focal, focal, 0.5 * width, 0.5 * height)
+        fx = fy = 0.5 * width / np.tan(0.5 * self.angle_x)
+        if self.angle_y is not None:
+            fy = 0.5 * height / np.tan(0.5 * self.angle_y)
+        return _matrix(fx, fy, 0.5 * width, 0.5 * height)
 
 
 @dataclass(frozen=True)
@@ -122,15 +126,14 @@ def checked_lens(values: Mapping[str, Any], where: str) -> Lens:
         for key in _LENS_KEYS
         if key in values
     }
-    angle = None
+    angle = vertical_angle = None
     if "camera_angle_x" in values:
         angle = checked_angle(values["camera_angle_x"], where)
-    if "camera_angle_y" in values and "fl_y" not in lengths and {"w", "h"} <= lengths.keys():
-        half_angle = 0.5 * checked_angle(values["camera_angle_y"], where)
-        lengths["fl_y"] = 0.5 * lengths["h"] / math.tan(half_angle)
+    if "camera_angle_y" in values and "fl_y" not in lengths:
+        vertical_angle = checked_angle(values["camera_angle_y"], where)
     if angle is not None and not lengths.keys() - {"w", "h"}:
         size = (int(lengths["w"]), int(lengths["h"])) if {"w", "h"} <= lengths.keys() else None
-        return AngleLens(angle, distortion, size)
+        return AngleLens(angle, vertical_angle, distortion, size)
     missing = [key for key in ("w", "h") if key not in lengths]
     if missing:
         raise SceneError(
@@ -138,6 +141,8 @@ def checked_lens(values: Mapping[str, Any], where: str) -> Lens:
             "the size of the images that it is in pixels of"
         )
     width, height = lengths["w"], lengths["h"]
+    if vertical_angle is not None:
+        lengths["fl_y"] = 0.5 * height / math.tan(0.5 * vertical_angle)
     if angle is not None:
         expected = 0.5 * width / math.tan(0.5 * angle)
         focal = lengths.setdefault("fl_x", expected)

@@ -31,7 +31,7 @@ MOST_FRAMES = 10_000
 """Most pictures of a turntable, or of a turn of the light."""
 
 
-_FRAME = re.compile(r"turntable_\d{4,}(?=_|$)")
+_FRAME = re.compile(r"turntable_\d{4,}(?=[_.]|$)")
 """Name of a frame of a turntable, or its part of the name of a file."""
 
 
