@@ -415,7 +415,10 @@ def draw(sweep: dict[str, Any], repeated: list[dict[str, dict[str, Point]]], pat
             axis.annotate(name, (change.ratio, change.mean), fontsize=8, **offset)
         front = pareto({name: (c.ratio, sign * c.mean) for name, c in changes.items()})
         positions = [(changes[name].ratio, changes[name].mean) for name in front]
-        axis.plot(*zip(*positions, strict=True), "-", color="0.7", zorder=0)
+        if positions:
+            axis.plot(*zip(*positions, strict=True), "-", color="0.7", zorder=0)
+        else:
+            axis.text(0.5, 0.5, "no figures", ha="center", transform=axis.transAxes)
         axis.axhline(0.0, color="0.85", linewidth=0.8, zorder=0)
         axis.set(title=f"{figure}{arrow(figure)}", xlabel="seconds, ratio", ylabel="difference")
         axis.margins(x=0.15)

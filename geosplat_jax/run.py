@@ -67,9 +67,9 @@ def _true_light(dataset: Dataset, lights: Mapping[str, EnvLight]) -> EnvLight | 
 
 
 def mesh_of_run(folder: RunFolder) -> MeshSettings | None:
-    """Return the settings of the mesh that a run started from; None without a run, or a mesh."""
+    """Return settings that name the mesh a run started from; None without a run, or a mesh."""
     geometry = folder.config().geometry if folder.exists else None
-    return geometry if isinstance(geometry, MeshSettings) else None
+    return geometry.file if isinstance(geometry, MeshSettings) else None
 
 
 class Run:

@@ -368,8 +368,11 @@ def test_what_is_too_short_to_be_worth_it_goes_with_all_after_it(seconds_left, m
     assert adjusted_config.stage("refine").steps == refine
 
 
-def test_a_later_stage_of_which_something_was_set_is_not_left_out():
-    overrides = ["stages.monte_carlo.batch_views=2", "stages.refine.steps=0"]
+@pytest.mark.parametrize(
+    "text", ["stages.monte_carlo.batch_views=2", "stages.monte_carlo={batch_views=2}"]
+)
+def test_a_later_stage_of_which_something_was_set_is_not_left_out(text):
+    overrides = [text, "stages.refine.steps=0"]
     budget_plan = plan(Budget(150.0), SIZE, slowness=1.0, overrides=overrides)
     assert [stage.name for stage in budget_plan.config.active_stages] == [
         "split_sum",

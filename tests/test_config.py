@@ -20,6 +20,7 @@ from geosplat_jax.fit.config import (
     config_warnings,
     differences,
     moved_setting,
+    override_paths,
     parse_override,
 )
 from geosplat_jax.fit.presets import (
@@ -414,6 +415,11 @@ def test_an_override_is_toml_or_a_bare_word():
     assert parse_override("a=word") == {"a": "word"}
 
 
+def test_a_table_changes_the_settings_in_it():
+    texts = ["a={b=1, c={d=2}}", "a.b=3", "e=[{f=1}]"]
+    assert override_paths(texts) == ("a.b", "a.c.d", "e")
+
+
 def test_schedules_are_lines_that_stay_at_their_end():
     line = Schedule(0.2, 0.01, 0.5)
     assert [line.at(p) for p in (0.0, 0.25, 0.5, 1.0)] == pytest.approx([0.2, 0.105, 0.01, 0.01])
@@ -563,6 +569,13 @@ def test_settings_without_effect_are_told(overrides, told):
     warnings = config_warnings(make_config(overrides=overrides))
     assert len(warnings) == len(told)
     assert all(phrase in text for phrase, text in zip(told, warnings, strict=True))
+
+
+def test_a_frozen_group_has_no_warm_up_to_finish():
+    overrides = ("stages.monte_carlo.steps=20", "stages.monte_carlo.rates.sdf=0")
+    warnings = config_warnings(make_config(overrides=overrides))
+    assert any("rates.deform.warmup = 50 is longer" in text for text in warnings)
+    assert not any("rates.sdf" in text for text in warnings)
 
 
 def test_whoever_reads_a_configuration_needs_no_other_module(tmp_path):

@@ -206,6 +206,51 @@ def test_what_fails_for_the_next_stage_spares_the_checkpoints_of_this_one(datase
     assert loop.meta()["to_come"] == {"stage": "monte_carlo", "capacities": {"hits": 256}}
 
 
+def test_a_stage_that_a_budget_takes_back_is_compiled_ahead_again(
+    dataset, folder, steps, monkeypatch
+):
+    steps()
+    loop = new_loop(dataset, CONFIG, folder)
+    told, next_stage = [], CONFIG.stage("monte_carlo")
+    loop.on_compile = told.append
+    without_next_stage = replace(
+        CONFIG,
+        stages=tuple(replace(s, steps=0) if s == next_stage else s for s in CONFIG.stages),
+    )
+
+    class Background:
+        """Stands for `Upcoming`, with nothing to do."""
+
+        stage = next_stage
+        is_ready, has_stopped = Upcoming.is_ready, Upcoming.has_stopped
+        give_up = Upcoming.give_up
+        capacities = Capacities(hits=256)
+        _is_wanted = True
+
+        def __init__(self, *arguments):
+            self.compiled = in_background(lambda: None)
+            self.compiled.result()
+
+    monkeypatch.setattr(loop_module, "Upcoming", Background)
+    monkeypatch.setattr(loop_module.Loop, "_next_stage_if_near", lambda *a: next_stage)
+    loop.prepare(0)
+    first = loop.upcoming
+    loop.prepare(1)
+    assert loop.upcoming is first
+    loop.retime(without_next_stage)
+    loop.retime(CONFIG)
+    assert not first.is_ready
+    loop.prepare(2)
+    assert loop.upcoming is not first
+    assert loop.upcoming.is_ready
+    assert told == ["split_sum"]
+    # Where there is no time to compile it again, the step that waits for it is announced.
+    loop.upcoming.give_up()
+    loop.state = replace(loop.state, step=jnp.int32(6))
+    loop.prepare(6)
+    assert told == ["split_sum", "monte_carlo"]
+
+
 def test_a_run_goes_on_from_the_end_of_a_stage_where_that_is_newer(dataset, folder, steps):
     """A run may have been killed while it compiled the programs of the next stage."""
     steps()

@@ -16,9 +16,11 @@ from geosplat_jax.fit.begin import Resume
 from geosplat_jax.fit.config import config_from_dict
 from geosplat_jax.fit.folder import RunFolder
 from geosplat_jax.fit.presets import make_config, with_mesh
+from geosplat_jax.fit.start_mesh import MeshSettings
 from geosplat_jax.fit.train import TrainingError, fit
 from geosplat_jax.io.meshes import read_mesh
-from geosplat_jax.io.start_mesh import read_start
+from geosplat_jax.io.start_mesh import digest_of, read_start
+from geosplat_jax.report.facts import changed_from_preset
 from geosplat_jax.run import Run, mesh_of_run, train
 from geosplat_jax.surface.triangle_mesh import TriangleMesh, VertexOffsets, connectivity
 
@@ -295,6 +297,17 @@ def test_the_inward_shift_of_a_mesh_starts_smaller_unless_it_was_set(files):
     assert start("default", "material.initial_shift_logit=0").initial_shift_logit == 0
     by_hand = make_config(overrides=("material.initial_shift_logit=-0.5",))
     assert with_mesh(by_hand, files["ball"]).material.initial_shift_logit == -0.5
+
+
+def test_settings_of_a_mesh_are_kept(files):
+    path, digest = str(files["ball"]), digest_of(files["ball"])
+    given = MeshSettings(path=path, digest=digest, edge_pixels=7, sides="both", max_faces=500)
+    config = make_config(quality="draft", mesh=given)
+    assert config.geometry == given
+    assert set(changed_from_preset(config)) == {
+        f"geometry.{name}" for name in ("edge_pixels", "sides", "max_faces")
+    }
+    assert make_config(quality="draft", mesh=given.file).geometry.edge_pixels == 3
 
 
 def test_a_mesh_that_is_given_twice_counts_once_and_two_are_refused(files):

@@ -17,7 +17,7 @@ from geosplat_jax.cli.arguments import command_line
 from geosplat_jax.cli.display import ProgressDisplay, console, say, say_refined
 from geosplat_jax.fit.begin import Anew, Begin, Resume, TakeOver
 from geosplat_jax.fit.cameras import CameraSettings
-from geosplat_jax.fit.config import Budget, Config, config_warnings
+from geosplat_jax.fit.config import Budget, Config, config_warnings, override_paths
 from geosplat_jax.fit.devices import Devices, choose_devices, connect_hosts
 from geosplat_jax.fit.folder import RunFolder
 from geosplat_jax.fit.listener import NOBODY, Listener, Listeners
@@ -182,8 +182,7 @@ def _request_of(arguments: argparse.Namespace, folder: RunFolder) -> _Request:
         mesh = mesh_of_run(folder) if arguments.resume else None
         config, model = config_from(arguments, mesh), None
         if arguments.model is not None:
-            paths = (text.partition("=")[0].strip() for text in arguments.overrides)
-            model = ModelChoice(by_hand=tuple(dict.fromkeys(paths)))
+            model = ModelChoice(by_hand=override_paths(arguments.overrides))
         return _Request(config, scene_options(arguments, config), model=model)
     if arguments.quality is not None or arguments.preset is not None:
         raise UsageError("--budget chooses the settings; leave --quality and --preset out")

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import jax
 
-from geosplat_jax.fit.config import Budget, Config, Pace, Stage
+from geosplat_jax.fit.config import Budget, Config, Pace, Stage, override_paths
 from geosplat_jax.fit.costs import (
     StageCost,
     expected_costs,
@@ -263,7 +263,7 @@ def _candidate(
 def _changes_later_stage(overrides: Sequence[str], config: Config) -> bool:
     """Whether an override changes a setting of a stage after the first."""
     later = tuple(f"stages.{stage.name}." for stage in config.active_stages[1:])
-    return any(text.startswith(later) for text in overrides)
+    return any(path.startswith(later) for path in override_paths(overrides))
 
 
 def _first_stage_alone(candidate: Plan) -> Plan:

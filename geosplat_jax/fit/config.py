@@ -7,6 +7,7 @@ of single settings are paths, such as ``geometry.resolution`` or ``stages.monte_
 import json
 import re
 import tomllib
+from collections.abc import Iterable
 from dataclasses import field, fields
 from itertools import pairwise
 from typing import Annotated, Any, Literal
@@ -493,6 +494,14 @@ def parse_override(text: str) -> dict[str, Any]:
     return nested
 
 
+def override_paths(texts: Iterable[str]) -> tuple[str, ...]:
+    """Return the path of every single setting that overrides change, each once.
+
+    ``a.b=1`` and ``a={b=1}`` both change ``a.b``. `ValueError` as for `parse_override`.
+    """
+    return tuple(dict.fromkeys(path for text in texts for path in _flat(parse_override(text))))
+
+
 _OPEN = re.compile(r"stages\.\w+\.(rates|weights)\.")
 """Sections in which overrides may add names to those of the preset; `Config` checks the names."""
 
@@ -586,7 +595,7 @@ def config_warnings(config: Config) -> list[str]:
         )
     for stage in config.active_stages:
         for name, rate in stage.rates.items():
-            if rate.warmup > stage.position(stage.steps):
+            if rate.value > 0 and rate.warmup > stage.position(stage.steps):
                 warnings.append(
                     f"stages.{stage.name}.rates.{name}.warmup = {rate.warmup} is longer than the "
                     f"stage's {stage.steps} steps: the full rate will not be reached; half of the "

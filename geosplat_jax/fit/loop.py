@@ -235,7 +235,9 @@ class Loop:
             self._announce()
             self._compile(step)
         next_stage = self._next_stage_if_near(step)
-        if next_stage is not None and self.upcoming is None:
+        # A budget may have left the stage out, and come back to it.
+        is_missing = self.upcoming is None or self.upcoming.has_stopped
+        if next_stage is not None and is_missing:
             # A copy, since the steps to come consume the buffers of the state.
             params = jax.tree.map(jnp.array, self.params)
             present = PresentStage(

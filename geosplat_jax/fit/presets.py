@@ -398,7 +398,8 @@ def with_mesh(config: Config, mesh: str | Path | MeshSettings) -> Config:
     Parameters
     ----------
     config : settings of an isosurface. Settings that start from this mesh already stay as they are.
-    mesh : file, or the settings of a run that started from one, whose file is not read.
+    mesh : file, or settings of the surface, whose file is not read. An edge length that is not the
+        default one is kept; otherwise the quality level gives it.
 
     Raises
     ------
@@ -413,8 +414,10 @@ def with_mesh(config: Config, mesh: str | Path | MeshSettings) -> Config:
                 "given as well; give only one of the two"
             )
         return config
-    edge_pixels = _MESH_EDGES.get(config.quality, _MESH_EDGES["standard"])
-    geometry = MeshSettings(path=new_mesh.path, digest=new_mesh.digest, edge_pixels=edge_pixels)
+    geometry = new_mesh
+    if new_mesh.edge_pixels == MeshSettings().edge_pixels:
+        edge_pixels = _MESH_EDGES.get(config.quality, _MESH_EDGES["standard"])
+        geometry = replace(new_mesh, edge_pixels=edge_pixels)
     old_geometry, is_original = config.geometry, config.preset != "default"
     stages = []
     for stage in config.stages:

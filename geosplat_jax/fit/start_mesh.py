@@ -39,6 +39,11 @@ class MeshSettings(SurfaceSettings, kind="mesh"):
     at twice the cost. Both sides need raster.cull_backfaces."""
 
     @property
+    def file(self) -> "MeshSettings":
+        """The same file, with all other settings at their defaults."""
+        return MeshSettings(path=self.path, digest=self.digest)
+
+    @property
     def rate_groups(self) -> tuple[str, ...]:
         """Learning rate of `VertexOffsets`."""
         return ("vertices",)

@@ -144,7 +144,12 @@ class Upcoming:
     @property
     def is_ready(self) -> bool:
         """Whether the programs are compiled, or their compilation has failed."""
-        return self.compiled.done()
+        return self._is_wanted and self.compiled.done()
+
+    @property
+    def has_stopped(self) -> bool:
+        """Whether it was given up, and compiles nothing any more."""
+        return not self._is_wanted and self.compiled.done()
 
     def give_up(self) -> None:
         """Compile no further programs."""

@@ -209,7 +209,7 @@ def _preset_of(config: Config, overrides: Sequence[str] = ()) -> Config:
         name,
         level,
         material_prior=prior,
-        mesh=geometry if isinstance(geometry, MeshSettings) else None,
+        mesh=geometry.file if isinstance(geometry, MeshSettings) else None,
         overrides=tuple(overrides),
     )
     return replace(
