@@ -118,6 +118,7 @@ TINY = (
     "geometry.resolution=10",
     "stages.split_sum.steps=4",
     "stages.split_sum.batch_views=1",
+    "stages.split_sum.average=0.5",
     "stages.monte_carlo.steps=0",
     "stages.refine.steps=0",
     "run.checkpoint_every=2",

@@ -16,7 +16,7 @@ from geosplat_jax.fit.loop import new_loop, resumed_loop
 from geosplat_jax.fit.presets import make_config
 from geosplat_jax.fit.runtime import in_background
 from geosplat_jax.fit.stages import build_pipeline, make_batch
-from geosplat_jax.fit.step import StepReport
+from geosplat_jax.fit.step import Average, StepReport
 from geosplat_jax.fit.trained import NextStage
 from geosplat_jax.fit.upcoming import Upcoming, continued
 from geosplat_jax.pipeline import LossReport
@@ -224,7 +224,7 @@ def test_a_stage_that_a_budget_takes_back_is_compiled_ahead_again(
         stage = next_stage
         is_ready, has_stopped = Upcoming.is_ready, Upcoming.has_stopped
         give_up = Upcoming.give_up
-        capacities = Capacities(hits=256)
+        capacities, is_planned, meta = Capacities(hits=256), True, Upcoming.meta
         _is_wanted = True
 
         def __init__(self, *arguments):
@@ -249,6 +249,27 @@ def test_a_stage_that_a_budget_takes_back_is_compiled_ahead_again(
     loop.state = replace(loop.state, step=jnp.int32(6))
     loop.prepare(6)
     assert told == ["split_sum", "monte_carlo"]
+
+
+def test_a_stage_ends_with_its_average(dataset, folder, steps):
+    steps()
+    stage = CONFIG.stage("split_sum")
+    stages = (replace(stage, average=0.5), *CONFIG.stages[1:])
+    loop = new_loop(dataset, replace(CONFIG, stages=stages), folder)
+    # The stand-in for the step leaves it to us to count and to average.
+    recorder = loop_module.train_step
+    for step in range(6):
+        loop.prepare(step)
+        loop.advance(step)
+        loop.finish_stage()
+        assert float(loop.params.log_exposure) == (0.25 if step == 5 else 0.0)
+        if step == 4:
+            params = replace(loop.params, log_exposure=jnp.float32(0.25))
+            loop.state = replace(loop.state, average=Average(params, jnp.int32(2)))
+    assert [bool(rule.averages) for rule in recorder.rules] == [False] * 3 + [True] * 3
+    loop.prepare(6)  # the next stage has none
+    assert float(loop.params.log_exposure) == 0.25
+    assert loop.state.average is None
 
 
 def test_a_run_goes_on_from_the_end_of_a_stage_where_that_is_newer(dataset, folder, steps):

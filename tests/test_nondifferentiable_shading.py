@@ -262,6 +262,7 @@ def test_the_floor_of_the_light_is_a_projection_after_the_step_and_no_kink():
     )
     zero_directions = jax.tree.map(jnp.zeros_like, params)
     rates = dict.fromkeys(rate_groups(params), jnp.asarray(1.0))
-    rule = UpdateRule(rates, jnp.asarray(0.0), jnp.asarray(0.0), jnp.asarray(0.01))
+    zero = jnp.asarray(0.0)
+    rule = UpdateRule(rates, zero, zero, jnp.asarray(0.01), averages=jnp.asarray(False))
     new_radiance = _moved(params, zero_directions, rule).light.radiance
     np.testing.assert_array_equal(new_radiance, np.maximum(radiance - 0.5, 0.01))

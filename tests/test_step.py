@@ -27,7 +27,7 @@ def params():
 def rule(**changes):
     rates = {name: jnp.float32(0.01) for name in CONFIG.rate_groups}
     knee, pyramid, smallest = jnp.float32(0.0), jnp.float32(0.0), jnp.float32(0.0)
-    return replace(UpdateRule(rates, knee, pyramid, smallest), **changes)
+    return replace(UpdateRule(rates, knee, pyramid, smallest, jnp.asarray(False)), **changes)
 
 
 def test_every_parameter_has_a_declared_rate(params):
@@ -119,10 +119,10 @@ def whole_gradient(monkeypatch):
     monkeypatch.setattr(step, "value_and_gradient", value_and_gradient)
 
 
-def run_step(params, *, target=1.0, need=1, frozen=(), carry=0):
+def run_step(params, *, target=1.0, need=1, frozen=(), carry=0, state=None, averages=False):
     views = sphere_views(1, size=4)
     batch = Batch(views.camera([0]), jnp.asarray(views.images[:1]), jax.random.key(0))
-    state = initial_state(jax.tree.map(jnp.copy, params), carry=jnp.int32(carry))
+    state = state or initial_state(jax.tree.map(jnp.copy, params), carry=jnp.int32(carry))
     ball_pipeline, _ = ball(CONFIG, stage="monte_carlo")
     pipeline = Bowl(
         ball_pipeline.surface,
@@ -132,7 +132,7 @@ def run_step(params, *, target=1.0, need=1, frozen=(), carry=0):
         target=jnp.float32(target),
         need=jnp.int32(need),
     )
-    return train_step(state, batch, pipeline, rule(frozen=frozen))
+    return train_step(state, batch, pipeline, rule(frozen=frozen, averages=jnp.asarray(averages)))
 
 
 @pytest.mark.usefixtures("whole_gradient")
@@ -156,6 +156,27 @@ def test_a_step_that_overflows_or_is_not_finite_changes_nothing(params, broken):
     assert bool(report.finite) is ("target" not in broken)
     expected_state = initial_state(params, carry=jnp.int32(3))
     for a, b in zip(jax.tree.leaves(state), jax.tree.leaves(expected_state), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.usefixtures("whole_gradient")
+def test_the_average_is_over_the_steps_that_count(params):
+    state, exposures, means = initial_state(params, averages=True, carry=jnp.int32(0)), [], []
+    for averages in (True, False, True, True, True):
+        state, _ = run_step(params, state=state, averages=averages)
+        exposures.append(float(state.params.log_exposure))
+        means.append(float(state.average.params.log_exposure))
+    assert len(set(exposures)) == 5
+    # The second step does not count, and the average begins anew.
+    expected_means = [exposures[0], exposures[1], exposures[2]]
+    expected_means += [np.mean(exposures[2:4]), np.mean(exposures[2:])]
+    np.testing.assert_allclose(means, expected_means, rtol=1e-6)
+    assert means[2] == exposures[2]
+    assert int(state.average.count) == 3
+    # A step that does not fit leaves it as it was.
+    kept = jax.tree.map(jnp.copy, state)
+    state, _ = run_step(params, state=state, averages=True, need=5)
+    for a, b in zip(jax.tree.leaves(state), jax.tree.leaves(kept), strict=True):
         np.testing.assert_array_equal(a, b)
 
 

@@ -97,6 +97,9 @@ class Stage:
     """Steps after which rates have halved."""
     decay: Literal["exponential", "linear"] = "exponential"
     """How rates decay: by half-lives, or linearly to zero at the end of the stage."""
+    average: Annotated[float, Field(ge=0, le=1)] = 0.0
+    """Share of the stage, at its end, of which it ends with the mean of all parameters, each step
+    counting once. This takes out the noise of high rates. 0: it ends with its last step."""
     vertex_fraction: Annotated[float, Field(ge=0, lt=1)] = 0.0
     """Share of the stage, from its start, in which splats are sampled at vertices instead of faces
     (Eq. 12). This saves memory while a random first surface is rough; a visual hull does not need
@@ -143,6 +146,10 @@ class Stage:
     def samples_vertices(self, step: int) -> bool:
         """Whether the stage samples vertices (Eq. 12) ``step`` steps after its start."""
         return self.progress(step) < self.vertex_fraction
+
+    def averages(self, step: int) -> bool:
+        """Whether what the step makes, ``step`` steps after the start, counts for the average."""
+        return self.average > 0 and self.progress(step) >= 1.0 - self.average
 
     @property
     def ends_with_vertices(self) -> bool:

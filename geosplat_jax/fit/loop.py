@@ -38,6 +38,7 @@ from geosplat_jax.fit.stages import (
     update_rule,
 )
 from geosplat_jax.fit.step import (
+    Average,
     StepReport,
     TrainState,
     UpdateRule,
@@ -342,8 +343,25 @@ class Loop:
     def start(self, params: Params) -> None:
         """Begin the stage with these parameters."""
         self.fallback = StageStart.of(self.surface, params.geometry)
-        carry = self.pipeline.transport.first_carry()
-        self.state = self.devices.place(initial_state(params, step=self.step, carry=carry))
+        self._restart(params, self.pipeline.transport.first_carry())
+
+    def _restart(self, params: Params, carry: Any) -> None:
+        """Go on from these parameters at the present step, with a new optimiser."""
+        averages = self.stage.average > 0
+        state = initial_state(params, step=self.step, carry=carry, averages=averages)
+        self.state = self.devices.place(state)
+
+    def finish_stage(self) -> None:
+        """End the stage with its average if its last step is done; see `Stage.average`."""
+        if self.steps_of_stage < self.stage.steps:
+            return
+        state = self.devices.local(self.state)
+        average = state.average
+        if average is None or int(average.count) == 0:
+            return
+        # A copy, since a step consumes both.
+        params = jax.tree.map(jnp.array, average.params)
+        self.state = self.devices.place(replace(state, params=params))
 
     def advance(self, step: int) -> StepReport:
         """Make step ``step``, repeating the same batch with larger buffers as often as needed.
@@ -389,7 +407,10 @@ class Loop:
         optimizer = with_geometry(state.optimizer, replacement.carried)
         sizes = _sizes(params.geometry)
         params = replace(params, geometry=replacement.shape)
-        self.state = self.devices.place(replace(state, params=params, optimizer=optimizer))
+        # Parameters of another layout cannot be averaged with the ones before.
+        average = None if state.average is None else Average.none_of(params)
+        state = replace(state, params=params, optimizer=optimizer, average=average)
+        self.state = self.devices.place(state)
         self._put_surface(replacement.model)
         self._recompile_for_shape(sizes, step)
 
@@ -453,7 +474,7 @@ class Loop:
         shape = jax.tree.map(jnp.asarray, self.fallback.shape)
         params, carry = replace(self.params, geometry=shape), self.devices.local(self.state.carry)
         self._put_surface(self.fallback.surface)
-        self.state = self.devices.place(initial_state(params, step=self.step, carry=carry))
+        self._restart(params, carry)
         self._recompile_for_shape(sizes, step)
 
 

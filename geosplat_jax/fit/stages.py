@@ -103,7 +103,12 @@ def update_rule(config: Config, stage: Stage, params: Params, step: int) -> Upda
         "light_pyramid": stage.light_pyramid,
         "smallest_light": config.run.smallest_light,
     }
-    return UpdateRule(rates=_arrays(stage.rates_at(step)), frozen=stage.frozen, **_arrays(light))
+    return UpdateRule(
+        rates=_arrays(stage.rates_at(step)),
+        averages=jax.device_put(np.bool_(stage.averages(step))),
+        frozen=stage.frozen,
+        **_arrays(light),
+    )
 
 
 def _arrays(values: dict[str, float]) -> dict[str, Array]:

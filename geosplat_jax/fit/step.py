@@ -23,6 +23,34 @@ ADAM = optax.scale_by_adam(eps=1e-15)
 """Optimiser of all trainings; its steps are multiplied by the rates of the groups."""
 
 
+class Average(eqx.Module):
+    """Mean of the parameters after each of the last steps of a stage.
+
+    Attributes
+    ----------
+    params : the mean; the last parameters while no step counts.
+    count : () int32, number of steps in the mean.
+    """
+
+    params: Params
+    count: Int[Array, ""]
+
+    @classmethod
+    def none_of(cls, params: Params) -> "Average":
+        """Begin with a copy of the parameters and no step, since a step consumes both."""
+        return cls(jax.tree.map(jnp.array, params), jnp.int32(0))
+
+    def with_step(self, params: Params, counts: Bool[Array, ""]) -> "Average":
+        """Include the parameters after a step, or begin anew if the step does not count."""
+        count = jnp.where(counts, self.count + 1, 0)
+        share = 1.0 / jnp.maximum(count, 1).astype(jnp.float32)
+
+        def mean(old: Array, new: Array) -> Array:
+            return jnp.where(count > 1, old + share.astype(new.dtype) * (new - old), new)
+
+        return Average(jax.tree.map(mean, self.params, params), count)
+
+
 class TrainState(eqx.Module):
     """What a step reads and writes.
 
@@ -32,12 +60,14 @@ class TrainState(eqx.Module):
     optimizer : state of Adam.
     step : () int32, the number of updates made.
     carry : what the transport keeps from step to step; None for most.
+    average : mean over the last steps, in stages that end with it; else None.
     """
 
     params: Params
     optimizer: Any
     step: Int[Array, ""]
     carry: Any = None
+    average: Average | None = None
 
 
 class UpdateRule(eqx.Module):
@@ -51,6 +81,7 @@ class UpdateRule(eqx.Module):
     light_pyramid : () share of its step that every level of the light's pyramid makes, see
         `pyramid.from_levels`.
     smallest_light : () lower bound of a texel while the light is learned.
+    averages : () whether the parameters after the step count for the state's average.
     frozen : static; groups that are not differentiated.
     """
 
@@ -58,6 +89,7 @@ class UpdateRule(eqx.Module):
     light_knee: Float[Array, ""]
     light_pyramid: Float[Array, ""]
     smallest_light: Float[Array, ""]
+    averages: Bool[Array, ""]
     frozen: tuple[str, ...] = eqx.field(static=True, default=())
 
 
@@ -78,16 +110,18 @@ class StepReport(eqx.Module):
     fits: Bool[Array, ""]
 
 
-def initial_state(params: Params, *, step: int = 0, carry: Any = None) -> TrainState:
-    """Build the state before the first step of a stage.
+def initial_state(
+    params: Params, *, step: int = 0, carry: Any = None, averages: bool = False
+) -> TrainState:
+    """Build the state before the first step of a stage, which ``averages`` its last ones or not.
 
     The parameters are copied: a step consumes the buffers of its state, and a pipeline or the
     caller may hold the same arrays.
     """
     params = jax.tree.map(jnp.array, params)
-    return TrainState(
-        params, ADAM.init(pyramid.to_levels(params)), jnp.asarray(step, jnp.int32), carry
-    )
+    average = Average.none_of(params) if averages else None
+    optimizer = ADAM.init(pyramid.to_levels(params))
+    return TrainState(params, optimizer, jnp.asarray(step, jnp.int32), carry, average)
 
 
 def with_geometry(optimizer: Any, change: Callable[[Any], Any]) -> Any:
@@ -152,7 +186,10 @@ def _update(
         jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(gradient)])
     )
     fits = capacity_module.fits(report.usage, sizes)
-    advanced_state = TrainState(params, optimizer, state.step + 1, report.carry)
+    average = state.average
+    if average is not None:
+        average = average.with_step(params, rule.averages)
+    advanced_state = TrainState(params, optimizer, state.step + 1, report.carry, average)
     new_state = jax.tree.map(
         lambda new, old: jnp.where(finite & fits, new, old), advanced_state, state
     )

@@ -408,6 +408,7 @@ def _train(
             if pacer is not None:
                 _keep_pace(loop, pacer, None if loop.has_compiled else seconds)
                 clock.config = loop.config
+            loop.finish_stage()
             config, final_step = loop.config, last_step()
             seconds_left = clock.left(steps_done) if pacer is None else pacer.seconds_left
             progress = _progress(line, config, clock.elapsed, seconds_left)

@@ -83,7 +83,8 @@ def _template(config: Config, stage: Stage, description: Description) -> dict[st
         params = template_params(config, model, shape, stage)
         params = replace(params, splats=stage.splats.template(description.splats))
         carry = build_pipeline(config, stage, model).transport.first_carry()
-        return {"state": initial_state(params, carry=carry), "surface": model}
+        state = initial_state(params, carry=carry, averages=stage.average > 0)
+        return {"state": state, "surface": model}
 
     return jax.eval_shape(build)
 

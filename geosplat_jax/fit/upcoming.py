@@ -109,7 +109,9 @@ class Upcoming:
             carry = pipeline.transport.first_carry()
             state = jax.eval_shape(
                 lambda params: initial_state(
-                    begin_stage(params, present_pipeline, config, stage), carry=carry
+                    begin_stage(params, present_pipeline, config, stage),
+                    carry=carry,
+                    averages=stage.average > 0,
                 ),
                 params,
             )
