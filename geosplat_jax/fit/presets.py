@@ -113,9 +113,12 @@ def _default() -> Config:
     refine = Stage(
         name=REFINE,
         steps=100,
+        average=0.4,
         transport=monte_carlo.transport,
         splats=FreeSplatSettings(darkest_metal=0.2),
-        rates=_refinement_rates(albedo=5e-4, roughness_metallic=2e-3),
+        rates=_refinement_rates(
+            splat_scales=1e-2, splat_quats=2e-3, albedo=5e-4, roughness_metallic=2e-3
+        ),
         weights=_weights(**photometric, albedo_smoothness=0.02, **smooth, indirect=0.001),
     )
     return Config(
@@ -126,7 +129,13 @@ def _default() -> Config:
     )
 
 
-def _refinement_rates(*, albedo: float, roughness_metallic: float) -> dict[str, Rate]:
+def _refinement_rates(
+    *,
+    albedo: float,
+    roughness_metallic: float,
+    splat_scales: float = 5e-3,
+    splat_quats: float = 1e-3,
+) -> dict[str, Rate]:
     """Return the authors' rates of free splats, with those of the fields as given."""
     decaying = {
         "splat_means": 1.6e-4,
@@ -135,8 +144,8 @@ def _refinement_rates(*, albedo: float, roughness_metallic: float) -> dict[str, 
         "exposure": 5e-4,
     }
     steady = {
-        "splat_scales": 5e-3,
-        "splat_quats": 1e-3,
+        "splat_scales": splat_scales,
+        "splat_quats": splat_quats,
         "splat_opacities": 5e-2,
         "splat_albedo": 5e-3,
         "splat_indirect": 2.5e-3,
@@ -462,7 +471,14 @@ _QUALITY: dict[str, dict[str, Any]] = {
                     "roughness_metallic": {"value": 8e-3, "warmup": 75},
                 },
             },
-            REFINE: {"batch_views": 2},
+            REFINE: {
+                "batch_views": 2,
+                "rates": {
+                    "splat_normals": {"value": 3e-3},
+                    "splat_scales": {"value": 1.5e-2},
+                    "splat_quats": {"value": 3e-3},
+                },
+            },
         },
     },
     "standard": {},
