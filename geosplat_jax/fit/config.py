@@ -98,8 +98,8 @@ class Stage:
     decay: Literal["exponential", "linear"] = "exponential"
     """How rates decay: by half-lives, or linearly to zero at the end of the stage."""
     average: Annotated[float, Field(ge=0, le=1)] = 0.0
-    """Share of the stage, at its end, of which it ends with the mean of all parameters, each step
-    counting once. This takes out the noise of high rates. 0: it ends with its last step."""
+    """Share of the stage's steps, the last ones, over which all parameters are averaged. The stage
+    ends with this mean, which holds less of the noise of high rates. 0: with its last step."""
     vertex_fraction: Annotated[float, Field(ge=0, lt=1)] = 0.0
     """Share of the stage, from its start, in which splats are sampled at vertices instead of faces
     (Eq. 12). This saves memory while a random first surface is rough; a visual hull does not need

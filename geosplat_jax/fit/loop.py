@@ -99,7 +99,7 @@ class Loop:
     surface, pipeline : surface model and pipeline, on one device of this process, where everything
         between two steps is computed.
     stage : the present stage.
-    state : parameters, optimiser, step and carry, on all ``devices``.
+    state : parameters, optimiser, step, carry and average, on all ``devices``.
     devices : devices that the run trains on.
     share : share of the photographs' pixels that the windows hold.
     planned_for : stage and splats that the buffers were planned for.
