@@ -313,7 +313,7 @@ def test_a_missing_figure_leaves_a_scene_out_and_is_said():
     assert "nan" not in text
 
 
-def test_a_plot_compares_every_run_that_has_all_figures_with_the_base(tmp_path):
+def test_a_plot_compares_every_run_that_has_all_figures_with_the_base(tmp_path, monkeypatch):
     points = {
         "base": {"a": _point(20.0), "b": _point(30.0, seconds=20.0)},
         "more": {"a": _point(21.0, seconds=20.0), "b": _point(33.0, seconds=80.0)},
@@ -328,8 +328,12 @@ def test_a_plot_compares_every_run_that_has_all_figures_with_the_base(tmp_path):
     one_scene = {name: {"a": scenes["a"]} for name, scenes in points.items()}
     changes = trade.changes_over_time(_record(["a"]), [one_scene], "nvs.psnr")
     assert changes["more"] == trade.Change(2.0, 1.0, None)
-    pytest.importorskip("matplotlib")
+    pyplot, plots = pytest.importorskip("matplotlib.pyplot"), []
+    monkeypatch.setattr(pyplot, "close", plots.append)
+    sweep["figures"].append("relight.psnr")  # which no run has
     trade.draw(sweep, [points], tmp_path / "images" / "trade.png")
+    texts = [[text.get_text() for text in axis.texts] for axis in plots[0].axes]
+    assert texts == [["base", "more"], ["no figures"]]
     assert (tmp_path / "images" / "trade.png").read_bytes().startswith(b"\x89PNG")
 
 

@@ -136,7 +136,7 @@ def _refinement_rates(
     splat_scales: float = 5e-3,
     splat_quats: float = 1e-3,
 ) -> dict[str, Rate]:
-    """Return the authors' rates of free splats, with those of the fields as given."""
+    """Return the rates of free splats, by default the authors', and those of the fields."""
     decaying = {
         "splat_means": 1.6e-4,
         "splat_normals": 1e-3,
