@@ -203,6 +203,13 @@ def test_a_draft_of_the_originals_is_smaller_and_keeps_their_method():
         assert [s.weights for s in draft_config.stages] == [s.weights for s in full_config.stages]
 
 
+def test_a_draft_learns_its_light_twice_as_fast_and_halves_its_rates_once():
+    draft, standard = (make_config("default", quality).stages[0] for quality in QUALITIES[:2])
+    assert draft.rates["light"].value == 2 * standard.rates["light"].value
+    assert draft.rates_at(400)["light"] == pytest.approx(draft.rates["light"].value / 2)
+    assert {**draft.rates, "light": Rate(1e-2)} == standard.rates
+
+
 def test_overrides_reach_nested_settings_and_keep_types():
     config = make_config(
         overrides=(

@@ -460,7 +460,12 @@ _QUALITY: dict[str, dict[str, Any]] = {
         "geometry": {"resolution": 32},
         "material": {"grid": {"levels": 6, "features": 4, "log2_entries": 14, "finest": 128}},
         "stages": {
-            SPLIT_SUM: {"steps": 400, "batch_views": 2, "half_life": 200.0},
+            SPLIT_SUM: {
+                "steps": 400,
+                "batch_views": 2,
+                "half_life": 400.0,
+                "rates": {"light": {"value": 2e-2}},
+            },
             MONTE_CARLO: {
                 "steps": 150,
                 "batch_views": 2,
