@@ -1,7 +1,7 @@
 """Does `--model auto` find the model that a scene was made with? Scenes of known models.
 
     python experiments/studies/models.py --output FOLDER [--scenes matt,glossy] [--quality draft]
-        [--steps 100] [--size 96] [--views 48] [--full]
+        [--steps 150] [--size 96] [--views 48] [--full]
 
 Each scene is a shape with materials, rendered under ``examples/studio.hdr`` by this package's own
 Monte Carlo transport, from splats on a finer grid than that of any training. So its model is known
@@ -300,7 +300,7 @@ def main() -> None:
     parser.add_argument("--output", type=Path, required=True)
     parser.add_argument("--scenes", default=",".join(RECIPES))
     parser.add_argument("--quality", default="draft")
-    parser.add_argument("--steps", type=int, default=100)
+    parser.add_argument("--steps", type=int, default=ModelChoice().steps)
     parser.add_argument("--size", type=int, default=96)
     parser.add_argument("--views", type=int, default=48)
     parser.add_argument("--full", action="store_true")
