@@ -73,8 +73,9 @@ class ModelChoice:
     steps: PositiveCount = 150
     """Most steps of the first stage, and of every trial after it."""
     seeds: PositiveCount = 2
-    """Number of trainings of the smaller model, each with its own seed, that a gain is compared
-    with."""
+    """Most trainings of a model, each with its own seed. The first seed decides about a part that
+    gains less than its standard error; a part that gains more is compared with the spread over
+    seeds of the smaller model, and if that is larger, the larger model gets every seed as well."""
     hold_back: Annotated[int, Field(ge=2)] = 8
     """One in this many training views is held back."""
 
@@ -194,14 +195,15 @@ def _tried(
 ) -> Rung:
     """Compare the models with a part and without it.
 
-    More seeds of the smaller model are trained only where the gain exceeds its standard error.
+    Other seeds are trained only where the gain exceeds its standard error: first of the smaller
+    model, and of the larger one if the gain could be due to the seed alone.
     """
-    smaller = [trials.decibels(kept_names, 0)]
+    smaller = {0: trials.decibels(kept_names, 0)}
     smaller_mean = float(np.mean(smaller[0]))
     if trials.are_alike(kept_names, trial_names):
         return Rung(part.name, part.title, smaller_mean, None, None, True, _UNTRIED)
     try:
-        larger = trials.decibels(trial_names, 0)
+        larger = {0: trials.decibels(trial_names, 0)}
     except TrainingError as error:
         return Rung(part.name, part.title, smaller_mean, None, None, False, str(error))
     added_titles = [
@@ -211,13 +213,16 @@ def _tried(
     ]
     note = f"with {', '.join(added_titles)}" if added_titles else ""
     evidence = compare(larger, smaller, trials.blocks)
-    if evidence.is_kept:
-        for seed in range(1, trials.how.seeds):
-            # A seed whose training fails says nothing of the others.
-            with suppress(TrainingError):
-                smaller.append(trials.decibels(kept_names, seed))
+    if evidence.exceeds_error:
+        smaller = trials.decibels_of_seeds(kept_names)
         evidence = compare(larger, smaller, trials.blocks)
-    larger_mean = float(np.mean(larger))
+        if not evidence.is_kept:
+            larger = trials.decibels_of_seeds(trial_names)
+            evidence = compare(larger, smaller, trials.blocks)
+    seeds = smaller.keys() & larger.keys()
+    smaller_mean, larger_mean = (
+        float(np.mean([decibels[seed] for seed in seeds])) for decibels in (smaller, larger)
+    )
     return Rung(part.name, part.title, smaller_mean, larger_mean, evidence, evidence.is_kept, note)
 
 
@@ -434,6 +439,17 @@ class _Trials:
         if "failure" in self._measured[name]:
             raise TrainingError(self._measured[name]["failure"])
         return np.asarray(self._measured[name]["psnr"], float)
+
+    def decibels_of_seeds(self, kept: Collection[str]) -> dict[int, np.ndarray]:
+        """Return the decibels of a model on every held-back view, (V,), for each of the seeds.
+
+        A seed whose training fails is missing, since it says nothing of the others.
+        """
+        found = {}
+        for seed in range(self.how.seeds):
+            with suppress(TrainingError):
+                found[seed] = self.decibels(kept, seed)
+        return found
 
     def blocked_share(self) -> float:
         """Return the share of light that the first stage's surface blocks from itself.

@@ -63,7 +63,7 @@ def test_the_error_covers_the_mean_as_often_as_it_says():
 
 def test_one_block_says_nothing():
     assert clustered_error(np.ones(5), np.zeros(5, int)) == math.inf
-    assert not compare(np.full(5, 9.0), [np.zeros(5)], np.zeros(5, int)).is_kept
+    assert not compare({0: np.full(5, 9.0)}, {0: np.zeros(5)}, np.zeros(5, int)).is_kept
 
 
 def test_gains_are_paired():
@@ -71,7 +71,7 @@ def test_gains_are_paired():
     rng, blocks = np.random.default_rng(0), np.arange(12)
     smaller_scores = rng.uniform(20, 40, 12)
     larger_scores = smaller_scores + 0.05 + 0.02 * rng.normal(size=12)
-    comparison = compare(larger_scores, [smaller_scores], blocks)
+    comparison = compare({0: larger_scores}, {0: smaller_scores}, blocks)
     assert comparison.gain == pytest.approx(0.05, abs=0.02)
     assert comparison.standard_error < 0.01
     assert comparison.is_kept
@@ -80,19 +80,42 @@ def test_gains_are_paired():
     )
     assert unpaired_error > 10 * comparison.gain
     # The views must be the same ones, in the same order.
-    assert not compare(larger_scores[::-1], [smaller_scores], blocks).is_kept
+    assert not compare({0: larger_scores[::-1]}, {0: smaller_scores}, blocks).is_kept
 
 
 def test_a_gain_below_the_spread_over_seeds_is_not_kept():
     views = np.linspace(20, 30, 8)
-    seed_scores = [views, views + 0.6]
-    comparison = compare(views + 0.3, seed_scores, np.arange(8))
+    seed_scores = {0: views, 1: views + 0.6}
+    comparison = compare({0: views + 0.3}, seed_scores, np.arange(8))
     assert comparison.standard_error < 1e-9
     assert comparison.spread == pytest.approx(0.6 / math.sqrt(2))
     assert not comparison.is_kept
-    assert compare(views + 0.5, seed_scores, np.arange(8)).is_kept
-    # The first seed is that of the larger model, and the gain is measured against it.
-    assert compare(views + 0.3, seed_scores[::-1], np.arange(8)).gain == pytest.approx(-0.3)
+    assert compare({0: views + 0.5}, seed_scores, np.arange(8)).is_kept
+
+
+def test_two_seeds_show_a_gain_that_one_seed_leaves_open():
+    views = np.linspace(20, 30, 8)
+    smaller_scores = {0: views, 1: views + 0.5}
+    one_seed = compare({0: views + 0.3}, smaller_scores, np.arange(8))
+    two_seeds = compare({0: views + 0.3, 1: views + 0.8}, smaller_scores, np.arange(8))
+    assert (one_seed.gain, two_seeds.gain) == pytest.approx((0.3, 0.3))
+    assert two_seeds.spread == pytest.approx(one_seed.spread / math.sqrt(2))
+    assert (one_seed.seeds, two_seeds.seeds) == (1, 2)
+    assert not one_seed.is_kept
+    assert two_seeds.is_kept
+
+
+def test_models_are_compared_seed_by_seed():
+    """The training of seed 1 of the larger model has failed."""
+    views = np.linspace(20, 30, 8)
+    smaller_scores = {0: views, 1: views + 5.0, 2: views + 0.2}
+    comparison = compare({2: views + 0.6, 0: views + 0.2}, smaller_scores, np.arange(8))
+    assert comparison.gain == pytest.approx(0.3)
+    assert comparison.seeds == 2
+    # The other seed still tells how far seeds lie apart.
+    assert comparison.spread == pytest.approx(np.std([0.0, 5.0, 0.2], ddof=1) / math.sqrt(2))
+    with pytest.raises(ValueError, match="no seed in common"):
+        compare({3: views}, smaller_scores, np.arange(8))
 
 
 @pytest.mark.parametrize(

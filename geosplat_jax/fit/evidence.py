@@ -8,7 +8,7 @@ deviation over seeds, which is a low hurdle (docs/models.md).
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,19 +21,28 @@ class Evidence:
 
     Attributes
     ----------
-    gain : mean over the views of the larger model's decibels minus the smaller one's.
+    gain : mean over views, and over the seeds of both models, of the larger model's decibels minus
+        the smaller one's.
     standard_error : of the gain, over blocks of views; infinite for fewer than two blocks.
-    spread : standard deviation over seeds of the smaller model's mean; 0 for one seed.
+    spread : standard deviation over seeds of the smaller model's mean, divided by the root of the
+        number of seeds that the gain is a mean of; 0 where the smaller model has one seed.
+    seeds : number of seeds that the gain is a mean of.
     """
 
     gain: float
     standard_error: float
     spread: float = 0.0
+    seeds: int = 1
 
     @property
     def is_kept(self) -> bool:
         """Whether the gain exceeds both its standard error and the spread over seeds."""
-        return self.gain > self.standard_error and self.gain > self.spread
+        return self.exceeds_error and self.gain > self.spread
+
+    @property
+    def exceeds_error(self) -> bool:
+        """Whether the gain exceeds its standard error over views."""
+        return self.gain > self.standard_error
 
 
 @dataclass(frozen=True)
@@ -126,20 +135,29 @@ def clustered_error(values: Float[np.ndarray, " V"], blocks: Int[np.ndarray, " V
 
 
 def compare(
-    larger: Float[np.ndarray, " V"],
-    smaller: Sequence[Float[np.ndarray, " V"]],
+    larger: Mapping[int, Float[np.ndarray, " V"]],
+    smaller: Mapping[int, Float[np.ndarray, " V"]],
     blocks: Int[np.ndarray, " V"],
 ) -> Evidence:
     """Compare two models on the same V views.
 
+    Models are compared seed by seed; a seed that only the smaller model has counts for the spread.
+
     Parameters
     ----------
-    larger : (V,) decibels of the larger model.
-    smaller : (V,) decibels of the smaller model for every seed; the first has the larger model's
-        seed.
+    larger : (V,) decibels of the larger model, by seed.
+    smaller : (V,) decibels of the smaller model, by seed.
     blocks : (V,) block of each view.
+
+    Raises
+    ------
+    ValueError
+        If no seed is common to both models.
     """
-    gains = np.asarray(larger, float) - np.asarray(smaller[0], float)
-    means = [float(np.mean(decibels)) for decibels in smaller]
-    spread = float(np.std(means, ddof=1)) if len(means) > 1 else 0.0
-    return Evidence(float(gains.mean()), clustered_error(gains, blocks), spread)
+    seeds = larger.keys() & smaller.keys()
+    if not seeds:
+        raise ValueError("models are compared seed by seed, and these have no seed in common")
+    gains = np.mean([larger[seed] - smaller[seed] for seed in sorted(seeds)], axis=0)
+    means = [float(np.mean(decibels)) for decibels in smaller.values()]
+    spread = float(np.std(means, ddof=1)) / math.sqrt(len(seeds)) if len(means) > 1 else 0.0
+    return Evidence(float(gains.mean()), clustered_error(gains, blocks), spread, len(seeds))

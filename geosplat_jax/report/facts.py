@@ -152,6 +152,8 @@ def rung_row(rung: Mapping[str, Any]) -> tuple[str, str, str, str, str]:
         gain = f"{comparison['gain']:+.2f} +- {comparison['standard_error']:.2f} dB"
         if comparison["spread"]:
             gain += f", seeds {comparison['spread']:.2f}"
+        if comparison.get("seeds", 1) > 1:
+            gain += f" (mean of {comparison['seeds']})"
     verdict = "kept" if rung["is_kept"] else "left out"
     if rung["note"]:
         separator = ": " if comparison is None else ", " if rung["is_kept"] else ", even "
