@@ -190,6 +190,13 @@ def _among(names: Iterable[str], parts: Iterable[Part]) -> frozenset[str]:
     return frozenset(names) & {part.name for part in parts}
 
 
+def _added(part: Part, kept_names: Collection[str], trial_names: Collection[str]) -> str:
+    """Name the parts that are added with a part, because it needs them."""
+    names = set(trial_names) - {*kept_names, part.name}
+    titles = [added_part.title for added_part in LADDER if added_part.name in names]
+    return f"with {', '.join(titles)}" if titles else ""
+
+
 def _tried(
     trials: "_Trials", part: Part, kept_names: Collection[str], trial_names: Collection[str]
 ) -> Rung:
@@ -206,12 +213,7 @@ def _tried(
         larger = {0: trials.decibels(trial_names, 0)}
     except TrainingError as error:
         return Rung(part.name, part.title, smaller_mean, None, None, False, str(error))
-    added_titles = [
-        added_part.title
-        for added_part in LADDER
-        if added_part.name in set(trial_names) - {*kept_names, part.name}
-    ]
-    note = f"with {', '.join(added_titles)}" if added_titles else ""
+    note = _added(part, kept_names, trial_names)
     evidence = compare(larger, smaller, trials.blocks)
     if evidence.exceeds_error:
         smaller = trials.decibels_of_seeds(kept_names)
@@ -236,13 +238,16 @@ def _seen_on_surface(
     """
     smaller_mean = float(np.mean(trials.decibels(kept_names, 0)))
     share = trials.blocked_share()
-    note = f"the surface blocks {100 * share:.1f} % of a uniform sky's light from itself"
-    if share > _BLOCKED and not trials.are_alike(kept_names, trial_names):
+    is_kept = share > _BLOCKED
+    reason = f"the surface blocks {100 * share:.1f} % of a uniform sky's light from itself"
+    added = _added(part, kept_names, trial_names) if is_kept else ""
+    note = f"{reason}, {added}" if added else reason
+    if is_kept and not trials.are_alike(kept_names, trial_names):
         try:
             trials.decibels(trial_names, 0)
         except TrainingError as error:
             return Rung(part.name, part.title, smaller_mean, None, None, False, str(error))
-    return Rung(part.name, part.title, smaller_mean, None, None, share > _BLOCKED, note)
+    return Rung(part.name, part.title, smaller_mean, None, None, is_kept, note)
 
 
 class _Trials:

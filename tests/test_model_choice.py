@@ -124,7 +124,23 @@ def test_the_surface_decides_whether_there_are_shadows(
     assert names_of(choice) == ["specular", *(["shadows"] if is_kept else [])]
     (rung,) = (rung for rung in choice.record()["rungs"] if rung["part"] == "shadows")
     reason = f"the surface blocks {100 * share:.1f} % of a uniform sky's light from itself"
-    assert rung_row(rung)[2:] == ("-", "-", f"{'kept' if is_kept else 'left out'}: {reason}")
+    verdict = f"kept: {reason}, with sampled light" if is_kept else f"left out: {reason}"
+    assert rung_row(rung)[2:] == ("-", "-", verdict)
+    transport = choice.config.stage("monte_carlo").transport
+    assert transport.kind == ("monte_carlo" if is_kept else "split_sum")
+
+
+def test_samples_are_tried_for_the_specular_lobe_alone(dataset, trainings, tmp_path):
+    """The split sum of a Lambertian surface is exact; on metal its lobes have the wrong shape."""
+    trainings.gains = {"specular": 2.0, "sampling": 1.0}
+    choice = choose_model(dataset, make_config(quality="draft"), tmp_path / "run")
+    assert names_of(choice) == ["specular", "sampling"]
+    transport = choice.config.stage("monte_carlo").transport
+    assert (transport.kind, transport.occlusion) == ("monte_carlo", False)
+    trainings.gains = {"sampling": 1.0}
+    matt_choice = choose_model(dataset, make_config(quality="draft"), tmp_path / "matt")
+    assert names_of(matt_choice) == []
+    assert "sampling" not in [rung.part for rung in matt_choice.rungs]
 
 
 def test_what_the_surface_blocks_is_noted_with_the_other_figures(

@@ -11,7 +11,7 @@ from geosplat_jax.fit.presets import PRESETS, QUALITIES, make_config
 from geosplat_jax.fit.stages import initial_params, update_rule
 from geosplat_jax.materials import init_materials
 from geosplat_jax.render import Params
-from geosplat_jax.transport.environment import init_light
+from geosplat_jax.transport.environment import LightSpec, init_light
 from geosplat_jax.transport.monte_carlo import MonteCarloSettings
 from geosplat_jax.transport.split_sum import SplitSumSettings
 
@@ -65,13 +65,36 @@ def test_what_needs_another_part_is_taken_out_with_its_own_settings_only():
     assert "indirect" not in direct_config.stage("monte_carlo").weights
 
 
+@pytest.mark.parametrize("kind", ["monte_carlo", "paths"])
+def test_without_shadows_light_is_sampled_and_meets_no_surface(kind):
+    overrides = (
+        f"stages.monte_carlo.transport.kind={kind}",
+        "stages.monte_carlo.transport.light_count=7",
+        "stages.monte_carlo.transport.residual_count=3",
+        "stages.refine.domain.kind=per_pixel",
+        "stages.refine.domain.points=mesh",
+    )
+    config = make_config(overrides=overrides)
+    open_config = LADDER[NAMES.index("shadows")].removed(config)
+    transport = open_config.stage("monte_carlo").transport
+    assert isinstance(transport, MonteCarloSettings)
+    assert (transport.occlusion, transport.indirect) == (False, "none")
+    assert (transport.light_count, transport.residual_count) == (7, 3)
+    for stage in open_config.stages:
+        assert not stage.domain.uses_rays
+        assert not stage.transport.build(LightSpec()).uses_rays
+        assert "indirect" not in stage.weights
+    assert open_config.stage("split_sum") == config.stage("split_sum")
+
+
 @pytest.mark.parametrize(
     ("paths", "missing"),
     [
         (["material.specular"], {"specular", "roughness"}),
         (["material.has_metallic"], {"metallic", "specular"}),  # with the part that it needs
-        (["stages.monte_carlo.transport.occlusion"], {"shadows"}),
-        (["stages.monte_carlo.transport.indirect"], {"indirect", "shadows"}),
+        (["stages.monte_carlo.transport.occlusion"], {"shadows", "sampling"}),
+        (["stages.monte_carlo.transport.kind"], {"shadows", "sampling"}),
+        (["stages.monte_carlo.transport.indirect"], {"indirect", "shadows", "sampling"}),
         (["material.grid.levels", "light.width"], {"hash", "light"}),
         (["geometry.resolution", "material.has_shift"], {"cells", "shift"}),
         (["run.seed", "stages.monte_carlo.steps"], set()),
@@ -87,7 +110,17 @@ def test_what_was_set_by_hand_is_not_chosen(paths, missing):
     [
         (("material.specular=none",), {"specular", "roughness", "metallic"}),
         (("material.specular=uniform",), {"roughness"}),
-        (("stages.monte_carlo.steps=0", "stages.refine.steps=0"), {"shadows", "indirect"}),
+        (
+            ("stages.monte_carlo.steps=0", "stages.refine.steps=0"),
+            {"sampling", "shadows", "indirect"},
+        ),
+        (
+            (
+                "stages.monte_carlo.transport.occlusion=false",
+                "stages.refine.transport.occlusion=false",
+            ),
+            {"shadows"},
+        ),
         (("geometry.resolution=5",), {"cells"}),
     ],
 )
@@ -97,7 +130,7 @@ def test_parts_that_settings_lack_or_never_use_are_not_offered(overrides, missin
 
 
 def test_what_is_left_out_has_no_parameters():
-    """Every part adds parameters, except shadows and indirect light, and cells of a given shape."""
+    """Every part adds parameters, except those of light transport, and cells of a given shape."""
     config = tiny_config("light.height=16", "light.width=32", "material.grid.finest=64")
     shape = {"sdf": jax.numpy.zeros(3)}
 
@@ -110,7 +143,7 @@ def test_what_is_left_out_has_no_parameters():
     adds_parameters = {name: b > a for name, a, b in zip(NAMES, sizes, sizes[1:], strict=False)}
     assert adds_parameters == {
         **dict.fromkeys(("specular", "roughness", "metallic", "shift", "hash", "light"), True),
-        **dict.fromkeys(("shadows", "indirect", "cells"), False),
+        **dict.fromkeys(("sampling", "shadows", "indirect", "cells"), False),
     }
 
 

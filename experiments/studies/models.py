@@ -122,10 +122,10 @@ def _metal(points: jax.Array) -> Materials:
 
 RECIPES = {
     "matt": Recipe(ONE_BALL, _matt),
-    "shadowed": Recipe(FOUR_BALLS, _matt, frozenset({"shadows", "indirect"})),
-    "glossy": Recipe(ONE_BALL, _glossy, frozenset({"specular"})),
-    "two_gloss": Recipe(ONE_BALL, _two_gloss, frozenset({"specular", "roughness"})),
-    "metal": Recipe(ONE_BALL, _metal, frozenset({"specular", "metallic"})),
+    "shadowed": Recipe(FOUR_BALLS, _matt, frozenset({"sampling", "shadows", "indirect"})),
+    "glossy": Recipe(ONE_BALL, _glossy, frozenset({"specular", "sampling"})),
+    "two_gloss": Recipe(ONE_BALL, _two_gloss, frozenset({"specular", "roughness", "sampling"})),
+    "metal": Recipe(ONE_BALL, _metal, frozenset({"specular", "metallic", "sampling"})),
 }
 SIZES = frozenset({"hash", "light", "cells"})
 """Parts that are resolutions, which a recipe does not determine."""

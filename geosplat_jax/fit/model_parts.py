@@ -8,13 +8,15 @@ that explains least.
 
 import abc
 from collections.abc import Collection, Iterable
-from dataclasses import replace
+from dataclasses import fields, replace
 from fnmatch import fnmatchcase
 from typing import ClassVar
 
 from geosplat_jax.fit.config import Config, Stage
 from geosplat_jax.fit.surfaces import FlexiCubesSettings
 from geosplat_jax.transport.monte_carlo import MonteCarloSettings
+from geosplat_jax.transport.paths import PathSettings
+from geosplat_jax.transport.sampled import SampledSettings
 from geosplat_jax.transport.split_sum import SplitSumSettings
 
 _FEWER_CELLS = 2.0 / 3.0
@@ -110,21 +112,32 @@ def _without_indirect_weight(stage: Stage) -> Stage:
     return replace(stage, weights={n: w for n, w in stage.weights.items() if n != "indirect"})
 
 
-class Shadows(Part):
-    """Shadows that are traced by rays; without them all stages use the split sum.
+def _without_shadows(stage: Stage) -> Stage:
+    """Return a stage of sampled light whose rays meet no surface; others as they are."""
+    transport = stage.transport
+    if isinstance(transport, PathSettings):
+        common = {field.name: getattr(transport, field.name) for field in fields(SampledSettings)}
+        transport = MonteCarloSettings(**common)
+    if not isinstance(transport, MonteCarloSettings) or not (
+        transport.occlusion or stage.domain.uses_rays
+    ):
+        return stage
+    open_transport = replace(transport, occlusion=False, indirect="none")
+    return _without_indirect_weight(
+        replace(stage, transport=open_transport, domain=stage.domain.without_rays())
+    )
 
-    Photographs under one light do not decide: a darker albedo explains them as well, and is wrong
-    under any other light. So the surface decides, by the share of a uniform sky's light that it
-    blocks from itself.
+
+class SampledLight(Part):
+    """Light that is integrated by samples; without it all stages use the split sum.
+
+    The split sum is exact for a Lambertian surface that nothing shades. Its lobes are not stretched
+    at grazing angles as those of glossy surfaces are.
     """
 
-    name, title = "shadows", "traced shadows"
-    settings = (
-        "stages.*.transport.kind",
-        "stages.*.transport.occlusion",
-        "stages.*.domain.points",
-    )
-    shows_in_photographs = False
+    name, title = "sampling", "sampled light"
+    settings = ("stages.*.transport.kind", "stages.*.domain.points")
+    follows = ("specular",)
 
     def removed(self, config: Config) -> Config:
         """Give every stage the split sum."""
@@ -139,12 +152,37 @@ class Shadows(Part):
         )
 
 
+class Shadows(Part):
+    """Shadows that are traced by rays; without them rays meet no surface.
+
+    Photographs under one light do not decide: a darker albedo explains them as well, and is wrong
+    under any other light. So the surface decides, by the share of a uniform sky's light that it
+    blocks from itself.
+    """
+
+    name, title = "shadows", "traced shadows"
+    settings = (
+        "stages.*.transport.kind",
+        "stages.*.transport.occlusion",
+        "stages.*.domain.points",
+    )
+    needs = ("sampling",)
+    shows_in_photographs = False
+
+    def removed(self, config: Config) -> Config:
+        """Let no surface block samples, except for a point's own face."""
+        return _with_stages(
+            config,
+            (_without_shadows(stage) if stage.steps else stage for stage in config.stages),
+        )
+
+
 class IndirectLight(Part):
     """Light from blocked directions."""
 
     name, title = "indirect", "indirect light"
     settings = ("stages.*.transport.indirect", "stages.*.weights.indirect*")
-    needs = follows = ("shadows",)
+    needs, follows = ("sampling", "shadows"), ("shadows",)
 
     def removed(self, config: Config) -> Config:
         """Make blocked directions black."""
@@ -232,6 +270,7 @@ LADDER: tuple[Part, ...] = (
     Specular(),
     RoughnessField(),
     Metallic(),
+    SampledLight(),
     Shadows(),
     IndirectLight(),
     Shift(),
