@@ -42,8 +42,7 @@ class _Trainings:
 
     ``gains`` : decibels that each part adds. ``made`` : names of the trainings, in order.
     ``fails`` : parts whose trainings fail, because of ``cause``. ``unlucky`` : name of a training
-    that ends half a decibel lower. ``stops_at`` : number of the
-    training that is interrupted.
+    that ends half a decibel lower. ``stops_at`` : number of the training that is interrupted.
     """
 
     def __init__(self, monkeypatch, gains):
@@ -131,7 +130,7 @@ def test_the_surface_decides_whether_there_are_shadows(
 
 
 def test_samples_are_tried_for_the_specular_lobe_alone(dataset, trainings, tmp_path):
-    """The split sum of a Lambertian surface is exact; on metal its lobes have the wrong shape."""
+    """The split sum approximates the lobe; without one there is nothing for samples to improve."""
     trainings.gains = {"specular": 2.0, "sampling": 1.0}
     choice = choose_model(dataset, make_config(quality="draft"), tmp_path / "run")
     assert names_of(choice) == ["specular", "sampling"]

@@ -131,8 +131,8 @@ def _without_shadows(stage: Stage) -> Stage:
 class SampledLight(Part):
     """Light that is integrated by samples; without it all stages use the split sum.
 
-    The split sum is exact for a Lambertian surface that nothing shades. Its lobes are not stretched
-    at grazing angles as those of glossy surfaces are.
+    The split sum of a Lambertian surface without shadows approximates nothing but the light between
+    texels. It does not stretch specular lobes at grazing angles (`transport.split_sum`).
     """
 
     name, title = "sampling", "sampled light"
