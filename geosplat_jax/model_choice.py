@@ -3,8 +3,9 @@
 Beginning with the smallest model, the parts of `fit.model_parts.LADDER` are tried one after the
 other. The larger model is trained as long as the smaller one, from the same first stage and on the
 same views, and views that were held back show whether it is better (`fit.evidence`). Trainings are
-short and use reduced photographs. Every measurement is written to a file, so that a choice that was
-interrupted continues without repeating a training.
+short and use reduced photographs. Parts that later ones may have made unnecessary are at last left
+out once more. Every measurement is written to a file, so that a choice that was interrupted
+continues without repeating a training.
 """
 
 import hashlib
@@ -56,6 +57,9 @@ _BLOCKED = 0.02
 """Shadows are kept if the surface blocks more than this share of a uniform sky's light from
 itself."""
 
+_CLEAR_GAIN = 2.0
+"""A part is not tried again if it gained more than this many times what later parts gained."""
+
 _LATER_PARTS = ("shift", "hash", "light")
 """Parts that the first stages do without, which trials share."""
 
@@ -87,7 +91,9 @@ class ChosenModel:
     Attributes
     ----------
     config : settings of the training that is to follow, on all views.
-    rungs : results of all parts that were tried, in order.
+    kept : names of the parts that were chosen.
+    rungs : results of all parts in the order in which they were tried; of a part that was tried
+        again, the last one counts.
     by_hand : titles of the parts that were set by hand, and of those that these need.
     held_back : names of the views that were held back.
     trainings : number of trainings of models, those that failed included, first stages not.
@@ -95,6 +101,7 @@ class ChosenModel:
     """
 
     config: Config
+    kept: tuple[str, ...]
     rungs: tuple[Rung, ...]
     by_hand: tuple[str, ...]
     held_back: tuple[str, ...]
@@ -104,6 +111,7 @@ class ChosenModel:
     def record(self) -> dict[str, Any]:
         """Return the choice as plain values for ``run.json``."""
         return {
+            "kept": list(self.kept),
             "rungs": [asdict(rung) for rung in self.rungs],
             "by_hand": list(self.by_hand),
             "held_back": list(self.held_back),
@@ -155,7 +163,8 @@ def choose_model(
     trials = _Trials(dataset, config, choice_folder(output), how, listener)
     candidate_parts = offered_parts(config, how.by_hand)
     kept_names: frozenset[str] = frozenset()
-    rungs = []
+    rungs: list[Rung] = []
+    models_of_trials: dict[str, frozenset[str]] = {}
     with locked_folder(trials.state_path.parent, own=trials.state_path):
         trials.open(begin)
         if begin.replace:
@@ -169,12 +178,22 @@ def choose_model(
                 rung = _tried(trials, part, kept_names, trial_names)
             else:
                 rung = _seen_on_surface(trials, part, kept_names, trial_names)
-            kept_names = frozenset(trial_names) if rung.is_kept else kept_names
+            if rung.is_kept:
+                kept_names = models_of_trials[part.name] = trial_names
             rungs.append(rung)
             listener.on_rung(rung)
+        for part in reversed(candidate_parts):
+            if models_of_trials.get(part.name) == kept_names:
+                continue  # Nothing has changed since it was kept.
+            if _is_doubtful(part, kept_names, rungs):
+                rung = _tried_again(trials, part, kept_names)
+                kept_names = kept_names if rung.is_kept else kept_names - {part.name}
+                rungs.append(rung)
+                listener.on_rung(rung)
         trials.close()
     return ChosenModel(
         config=trials.model(kept_names),
+        kept=tuple(part.name for part in LADDER if part.name in kept_names),
         rungs=tuple(rungs),
         by_hand=tuple(
             part.title for part in LADDER if part.is_in(config) and part not in candidate_parts
@@ -226,6 +245,50 @@ def _tried(
         float(np.mean([decibels[seed] for seed in seeds])) for decibels in (smaller, larger)
     )
     return Rung(part.name, part.title, smaller_mean, larger_mean, evidence, evidence.is_kept, note)
+
+
+def _is_doubtful(part: Part, kept_names: Collection[str], rungs: Iterable[Rung]) -> bool:
+    """Tell whether parts that were kept after a part may have made it unnecessary.
+
+    Parts stay that photographs cannot judge, that no trial could compare, or without which another
+    part would not be there. Where a later part was kept without a gain to compare, any gain is in
+    doubt.
+    """
+    kept_parts = [kept_part for kept_part in LADDER if kept_part.name in kept_names]
+    if part not in kept_parts or not part.shows_in_photographs:
+        return False
+    if any(part.name in (*kept_part.needs, *kept_part.follows) for kept_part in kept_parts):
+        return False
+    found = {rung.part: rung.found for rung in rungs if rung.is_kept}
+    later_parts = kept_parts[kept_parts.index(part) + 1 :]
+    # A part that is only there because another one needs it has no entry, and no gain of its own.
+    later_gain = sum(
+        math.inf if (evidence := found[later_part.name]) is None else evidence.gain
+        for later_part in later_parts
+        if later_part.name in found
+    )
+    if part.name not in found:
+        return True
+    own_evidence = found[part.name]
+    return own_evidence is not None and own_evidence.gain <= _CLEAR_GAIN * later_gain
+
+
+def _tried_again(trials: "_Trials", part: Part, kept_names: Collection[str]) -> Rung:
+    """Compare a model with itself without a part, by the first seed.
+
+    The part has already gained more than another seed does, so it is left out only if its gain does
+    not exceed the standard error any more.
+    """
+    title = f"{part.title}, again"
+    larger = trials.decibels(kept_names, 0)
+    larger_mean = float(np.mean(larger))
+    try:
+        smaller = trials.decibels(frozenset(kept_names) - {part.name}, 0)
+    except TrainingError as error:
+        return Rung(part.name, title, None, larger_mean, None, True, str(error))
+    evidence = compare({0: larger}, {0: smaller}, trials.blocks)
+    smaller_mean = float(np.mean(smaller))
+    return Rung(part.name, title, smaller_mean, larger_mean, evidence, evidence.is_kept)
 
 
 def _seen_on_surface(

@@ -43,13 +43,14 @@ class _Trainings:
     ``gains`` : decibels that each part adds. ``made`` : names of the trainings, in order.
     ``fails`` : parts whose trainings fail, because of ``cause``. ``unlucky`` : name of a training
     that ends half a decibel lower. ``stops_at`` : number of the training that is interrupted.
+    ``covered`` : parts that gain nothing beside finer cells.
     """
 
     def __init__(self, monkeypatch, gains):
         self.gains, self.made, self.configs, self.fails, self.stops_at = gains, [], {}, (), None
         self.datasets = []
         self.seed_noise, self.blocked, self.cause = 0.0, 0.0, None
-        self.unlucky = ""
+        self.unlucky, self.covered = "", ()
         monkeypatch.setattr(model_choice, "fit", self._fit)
         monkeypatch.setattr(model_choice, "_start_of", lambda folder: object.__new__(Start))
         monkeypatch.setattr(model_choice._Trials, "_measure", self._measure)
@@ -68,7 +69,9 @@ class _Trainings:
 
     def _measure(self, folder):
         parts, seed = folder.name.split("_seed_")
-        total = sum(self.gains.get(part, 0.0) for part in parts.split("_"))
+        names = set(parts.split("_"))
+        counted_names = names - set(self.covered) if "cells" in names else names
+        total = sum(self.gains.get(part, 0.0) for part in counted_names)
         total -= 0.5 * (folder.name == self.unlucky)
         hardness = 25.0 + 5.0 * np.sin(np.arange(5))
         return hardness + total + self.seed_noise * int(seed) + 1e-3 * np.arange(5) % 3e-3
@@ -80,7 +83,12 @@ def trainings(monkeypatch):
 
 
 def names_of(chosen):
-    return [rung.part for rung in chosen.rungs if rung.is_kept]
+    """Parts that were kept for what they gain or by the surface, not because others need them."""
+    return list(dict.fromkeys(rung.part for rung in chosen.rungs if rung.is_kept))
+
+
+def rungs_of(choice, part):
+    return [rung for rung in choice.record()["rungs"] if rung["part"] == part]
 
 
 def test_parts_are_kept_for_what_they_gain(dataset, trainings, tmp_path):
@@ -106,10 +114,71 @@ def test_a_part_brings_along_what_it_needs(dataset, trainings, tmp_path):
     choice = choose_model(dataset, make_config(quality="draft"), tmp_path / "run")
     assert names_of(choice) == ["roughness", "shadows", "indirect"]
     assert choice.config.material.specular == "field"
-    (rung,) = (rung for rung in choice.record()["rungs"] if rung["part"] == "roughness")
+    rung = rungs_of(choice, "roughness")[0]
     assert rung_row(rung)[-1] == "kept, with specular lobe, one roughness"
     assert not choice.config.material.has_metallic
     assert choice.config.stage("monte_carlo").transport.indirect == "constant"
+
+
+def test_a_part_goes_again_if_a_later_one_makes_it_unnecessary(dataset, trainings, tmp_path):
+    """Metallic can make up for some of the errors of coarse cells."""
+    trainings.gains = {"specular": 2.0, "roughness": 0.7, "metallic": 0.8, "cells": 1.4}
+    trainings.covered = ("metallic",)
+    config = make_config(quality="draft")
+    choice = choose_model(dataset, config, tmp_path / "run")
+    first_rung, second_rung = rungs_of(choice, "metallic")
+    assert first_rung["found"]["gain"] == pytest.approx(0.8)
+    assert second_rung["found"]["gain"] == pytest.approx(0.0)
+    assert rung_row(first_rung)[0] == "metallic"
+    assert rung_row(second_rung)[0] == "metallic, again"
+    assert rung_row(second_rung)[-1] == "left out"
+    # The roughness field is looked at after metallic has gone, and stays.
+    assert [rung["is_kept"] for rung in rungs_of(choice, "roughness")] == [True, True]
+    assert "specular_roughness_cells_seed_0" in trainings.made
+    assert trainings.made[-1] == "specular_cells_seed_0"
+    assert choice.kept == ("specular", "roughness", "cells")
+    omitted_parts = [part for part in LADDER if part.name not in choice.kept]
+    assert choice.config == without(config, omitted_parts)
+    assert choose_model(dataset, config, tmp_path / "run", begin=Resume()) == choice
+
+
+def test_clear_gains_and_the_last_part_are_not_tried_again(dataset, trainings, tmp_path):
+    trainings.gains = {"specular": 2.0, "metallic": 0.6, "light": 0.31, "cells": 0.2}
+    choice = choose_model(dataset, make_config(quality="draft"), tmp_path / "run")
+    # .6 dB are more than twice .2, but not more than twice .31 and .2 together.
+    counts = {part: len(rungs_of(choice, part)) for part in choice.kept}
+    assert counts == {"specular": 1, "metallic": 2, "light": 2, "cells": 1}
+    trainings.gains["metallic"] = 1.1
+    choice = choose_model(dataset, make_config(quality="draft"), tmp_path / "clear")
+    assert len(rungs_of(choice, "metallic")) == 1
+
+
+def test_a_part_that_was_brought_along_goes_with_the_one_that_needed_it(
+    dataset, trainings, tmp_path
+):
+    trainings.gains, trainings.covered = {"roughness": 1.0, "cells": 1.6}, ("roughness",)
+    choice = choose_model(dataset, make_config(quality="draft"), tmp_path / "run")
+    assert choice.kept == ("cells",)
+    assert [rung["is_kept"] for rung in rungs_of(choice, "roughness")] == [True, False]
+    assert [rung["is_kept"] for rung in rungs_of(choice, "specular")] == [False, False]
+    assert choice.config.material.specular == "none"
+
+
+def test_shadows_leave_no_earlier_gain_beyond_doubt(dataset, trainings, tmp_path):
+    """How much shadows gain is not measured, so nothing is clearly more."""
+    trainings.gains, trainings.blocked = {"specular": 2.0, "metallic": 3.0}, 0.1
+    choice = choose_model(dataset, make_config(quality="draft"), tmp_path / "run")
+    assert choice.kept == ("specular", "metallic", "sampling", "shadows")
+    assert [rung["is_kept"] for rung in rungs_of(choice, "metallic")] == [True, True]
+
+
+def test_a_part_stays_if_the_model_without_it_cannot_be_trained(dataset, trainings, tmp_path):
+    trainings.gains = {"specular": 2.0, "metallic": 0.8, "cells": 1.4}
+    trainings.covered, trainings.fails = ("metallic",), ("specular_cells_seed_0",)
+    choice = choose_model(dataset, make_config(quality="draft"), tmp_path / "run")
+    assert choice.kept == ("specular", "metallic", "cells")
+    _, second_rung = rungs_of(choice, "metallic")
+    assert rung_row(second_rung)[1:] == ("-", "29.54 dB", "-", "kept: the surface has exploded")
 
 
 @pytest.mark.parametrize(("share", "is_kept"), [(0.019, False), (0.021, True)])

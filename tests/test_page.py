@@ -124,7 +124,7 @@ def test_the_page_says_why_the_model_is_what_it_is(tmp_path, small):
     rung = {"part": "metallic", "title": "metallic", "smaller": 30.0, "larger": 31.25}
     rungs = [
         {**rung, "found": measurement, "is_kept": True, "note": ""},
-        {**rung, "title": "shift", "found": None, "is_kept": False, "note": "<x>"},
+        {**rung, "title": "shift", "larger": None, "found": None, "is_kept": False, "note": "<x>"},
     ]
     model = {"rungs": rungs, "by_hand": [], "held_back": ["a", "b"], "trainings": 7, "seconds": 9.0}
     path.write_text(json.dumps({**json.loads(path.read_text()), "model": model}))

@@ -327,7 +327,7 @@ def main() -> None:
         for rung in record["rungs"]:
             print("|", " | ".join((name, *rung_row(rung))), "|")
         result = {
-            "kept": [rung["part"] for rung in record["rungs"] if rung["is_kept"]],
+            "kept": record["kept"],
             "choosing": record["seconds"],
             "chosen": outcome(run, relit_truth, dataset.test),
         }

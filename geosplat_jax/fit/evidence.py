@@ -52,17 +52,18 @@ class Rung:
     Attributes
     ----------
     part, title : name of the part in files, and its name for people.
-    smaller : mean decibels of the held-back views without the part.
+    smaller : mean decibels of the held-back views without the part; None where that training
+        failed.
     larger : the same with the part; None where its training failed, and for a part that is not
         chosen by its gain (`Part.shows_in_photographs`) or that no trial contains.
-    found : the gain and its errors; None where ``larger`` is.
+    found : the gain and its errors; None where there are not both.
     is_kept : whether the part was kept.
     note : why there is no gain to compare, or which other parts were added with this one.
     """
 
     part: str
     title: str
-    smaller: float
+    smaller: float | None
     larger: float | None
     found: Evidence | None
     is_kept: bool

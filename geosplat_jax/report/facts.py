@@ -146,9 +146,11 @@ def curves(lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 def rung_row(rung: Mapping[str, Any]) -> tuple[str, str, str, str, str]:
     """Format a rung of ``run.json``: part of the model, PSNR without and with it, gain, verdict."""
-    comparison, larger_psnr, gain = rung["found"], "-", "-"
+    comparison, gain = rung["found"], "-"
+    smaller_psnr, larger_psnr = (
+        "-" if psnr is None else f"{psnr:.2f} dB" for psnr in (rung["smaller"], rung["larger"])
+    )
     if comparison is not None:
-        larger_psnr = f"{rung['larger']:.2f} dB"
         gain = f"{comparison['gain']:+.2f} +- {comparison['standard_error']:.2f} dB"
         if comparison["spread"]:
             gain += f", seeds {comparison['spread']:.2f}"
@@ -158,7 +160,7 @@ def rung_row(rung: Mapping[str, Any]) -> tuple[str, str, str, str, str]:
     if rung["note"]:
         separator = ": " if comparison is None else ", " if rung["is_kept"] else ", even "
         verdict += separator + rung["note"]
-    return rung["title"], f"{rung['smaller']:.2f} dB", larger_psnr, gain, verdict
+    return rung["title"], smaller_psnr, larger_psnr, gain, verdict
 
 
 def _finite(value: Any) -> float | int | None:
