@@ -60,6 +60,9 @@ itself."""
 _CLEAR_GAIN = 2.0
 """A part is not tried again if it gained more than this many times what later parts gained."""
 
+_NEGLIGIBLE_GAIN = 0.1
+"""A part that is tried again stays if it gains more than this, in decibels."""
+
 _LATER_PARTS = ("shift", "hash", "light")
 """Parts that the first stages do without, which trials share."""
 
@@ -276,8 +279,8 @@ def _is_doubtful(part: Part, kept_names: Collection[str], rungs: Iterable[Rung])
 def _tried_again(trials: "_Trials", part: Part, kept_names: Collection[str]) -> Rung:
     """Compare a model with itself without a part, by the first seed.
 
-    The part has already gained more than another seed does, so it is left out only if its gain does
-    not exceed the standard error any more.
+    The part has already gained more than another seed does, so it is left out only if its gain has
+    become negligible and does not exceed the standard error.
     """
     title = f"{part.title}, again"
     larger = trials.decibels(kept_names, 0)
@@ -288,7 +291,8 @@ def _tried_again(trials: "_Trials", part: Part, kept_names: Collection[str]) -> 
         return Rung(part.name, title, None, larger_mean, None, True, str(error))
     evidence = compare({0: larger}, {0: smaller}, trials.blocks)
     smaller_mean = float(np.mean(smaller))
-    return Rung(part.name, title, smaller_mean, larger_mean, evidence, evidence.is_kept)
+    is_kept = evidence.is_kept or evidence.gain > _NEGLIGIBLE_GAIN
+    return Rung(part.name, title, smaller_mean, larger_mean, evidence, is_kept)
 
 
 def _seen_on_surface(
