@@ -3,8 +3,8 @@
 Beginning with the smallest model, the parts of `fit.model_parts.LADDER` are tried one after the
 other. The larger model is trained as long as the smaller one, from the same first stage and on the
 same views, and views that were held back show whether it is better (`fit.evidence`). Trainings are
-short and use reduced photographs. Parts that later ones may have made unnecessary are at last left
-out once more. Every measurement is written to a file, so that a choice that was interrupted
+short and use reduced photographs. In the end, kept parts that later ones may have made unnecessary
+are tried once more. Every measurement is written to a file, so that a choice that was interrupted
 continues without repeating a training.
 """
 
